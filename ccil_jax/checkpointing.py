@@ -1,0 +1,48 @@
+"""Whole-state checkpoints: the only module that knows orbax."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from ccil_jax.types import PyTree
+
+KEPT = 2  # newest checkpoints that stay on disk
+
+
+class Checkpointer:
+    """Saves and restores one pytree per step under `directory`. Close it, or use it as a context manager."""
+
+    def __init__(self, directory: Path) -> None:
+        # Orbax fails in the background on a relative path.
+        options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, create=True)
+        self._manager = ocp.CheckpointManager(directory.resolve(), options=options)
+
+    def __enter__(self) -> "Checkpointer":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def latest_step(self) -> int | None:
+        """The newest finished step, or None."""
+        return self._manager.latest_step()
+
+    def save(self, step: int, state: PyTree) -> None:
+        """Starts saving; returns once the arrays are copied, so that the caller may donate them."""
+        self._manager.save(step, args=ocp.args.StandardSave(state))
+
+    def restore(self, step: int, like: PyTree) -> PyTree:
+        """The state saved at `step`; `like` gives structure, shapes and dtypes (arrays or ShapeDtypeStructs)."""
+        abstract = jax.eval_shape(lambda tree: tree, like)
+        return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+
+    def structure(self, step: int) -> PyTree:
+        """Shapes and dtypes of what was saved at `step`."""
+        return self._manager.item_metadata(step)
+
+    def close(self) -> None:
+        """Waits for saves in flight."""
+        self._manager.wait_until_finished()
+        self._manager.close()

@@ -1,0 +1,180 @@
+"""Hyperparameters. Importing this module imports no JAX, so launchers can answer `--help` at once.
+
+Every field is static (it shapes the program: changing it compiles anew) or traced (a number inside the program:
+sweeping it needs no compilation, and it may differ between vmapped runs).
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+METHOD_NAMES = ("malm", "cvag", "ccil", "lgail", "gail", "trpo", "expert")
+IMITATION_METHODS = frozenset({"malm", "cvag", "ccil", "lgail", "gail"})
+PRESCRIBED_LIMIT_METHODS = frozenset({"lgail", "expert"})
+
+CHOICES: Mapping[str, tuple[str, ...]] = {
+    "method": METHOD_NAMES,
+    "activation": ("tanh", "relu", "swish"),
+    "meta_gradient": ("full", "direct", "indirect", "none"),
+    "multiplier_update": ("adam", "sgd"),
+    "gate": ("batch", "episode"),
+    "reward_form": ("softplus", "logit", "log_sigmoid"),
+}
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot run. The message names the option and the remedy."""
+
+
+def _static(default: Any, help: str) -> Any:
+    return dataclasses.field(default=default, metadata={"traced": False, "help": help})
+
+
+def _traced(default: float | None, help: str) -> Any:
+    return dataclasses.field(default=default, metadata={"traced": True, "help": help})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """All choices of one training program. Defaults are Table 1 of the paper (`paper` preset).
+
+    Sources beyond Table 1 are in the field's help text; "authors" means the paper's public code.
+    """
+
+    method: str = _static("malm", "row of the methods table")
+    env_steps: int = _static(3_000_000, "environment steps per seed, rounded up to whole iterations")
+    num_envs: int = _static(16, "simulations stepped side by side, per seed")
+    batch_size: int = _static(2000, "environment steps per generator step, K (Table 1)")
+    generator_steps: int = _static(3, "policy updates per iteration, each on a fresh batch (Table 1)")
+    discriminator_steps: int = _static(1, "discriminator updates per iteration (Table 1)")
+    held_out_fraction: float = _static(0.3, "share of the batch kept for the outer loss, malm only (authors)")
+    hidden_sizes: tuple[int, ...] = _static((100, 100), "hidden layers of policy, critics and discriminator (Table 1)")
+    activation: str = _static("tanh", "activation of every network (Table 1)")
+    meta_gradient: str = _static("full", "outer step of malm: total derivative, one of its two parts, or none")
+    multiplier_update: str = _static("adam", "dual step: adam on softplus(xi) (authors) or projected sgd (Algorithm 1)")
+    gate: str = _static("batch", "cvag: one decision per batch (Algorithm 2) or per episode (authors)")
+    reward_form: str = _static("softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)")
+    cg_iterations: int = _static(10, "conjugate-gradient iterations (authors)")
+    fisher_stride: int = _static(5, "the Fisher product uses every n-th sample (authors)")
+    line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
+    critic_epochs: int = _static(5, "passes over the batch per critic regression (authors)")
+    critic_minibatch_size: int = _static(128, "samples per critic gradient step (authors)")
+    standardize_cost_advantage: bool = _static(False, "also divide the cost advantage by its deviation")
+    bootstrap_at_truncation: bool = _static(True, "use the critic's value at a time limit; false zeroes it (authors)")
+
+    gamma: float = _traced(0.995, "discount of reward and cost (Table 1)")
+    gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation (Table 1)")
+    max_kl: float = _traced(0.01, "trust-region radius, nats (Table 1)")
+    kl_tolerance: float = _traced(1.5, "a step is accepted up to this multiple of max_kl (authors)")
+    cg_damping: float = _traced(0.1, "added to the Fisher matrix's diagonal (authors)")
+    critic_learning_rate: float = _traced(1e-3, "Adam, both critics (Table 1)")
+    discriminator_learning_rate: float = _traced(3e-4, "Adam (Table 1)")
+    policy_entropy_coefficient: float = _traced(0.0, "beta, weight of the policy's entropy (Table 1)")
+    discriminator_entropy_coefficient: float = _traced(1e-3, "weight of the discriminator's entropy bonus (Table 1)")
+    initial_multiplier: float = _traced(0.01, "lambda before the first iteration (Table 1)")
+    multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)")
+    meta_learning_rate: float = _traced(0.05, "outer step size, malm only (Table 1)")
+    multiplier_max: float = _traced(100.0, "cap of the multiplier")
+    cost_limit: float | None = _traced(None, "episode cost limit; imitation takes the demonstrations' mean unless lgail")
+
+    @property
+    def num_steps(self) -> int:
+        """T: steps per simulation and generator step."""
+        return self.batch_size // self.num_envs
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps that one iteration of one seed consumes."""
+        return self.generator_steps * self.batch_size
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations needed to consume at least `env_steps`."""
+        return math.ceil(self.env_steps / self.steps_per_iteration)
+
+    @property
+    def num_held_out(self) -> int:
+        """V: samples kept for the outer loss; 0 for every method but malm."""
+        return int(self.held_out_fraction * self.batch_size) if self.method == "malm" else 0
+
+    @property
+    def num_training(self) -> int:
+        """M: samples of the policy step and the critic regressions."""
+        return self.batch_size - self.num_held_out
+
+    def replace(self, **changes: Any) -> "Config":
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+
+def field_names(*, traced: bool) -> tuple[str, ...]:
+    """Names of the traced or of the static fields, in declaration order."""
+    return tuple(f.name for f in dataclasses.fields(Config) if f.metadata["traced"] is traced)
+
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    "default": {},
+    "tiny": {
+        "env_steps": 240,
+        "num_envs": 4,
+        "batch_size": 40,
+        "hidden_sizes": (8, 8),
+        "critic_minibatch_size": 10,
+        "critic_epochs": 2,
+    },
+}
+
+
+def validate(config: Config) -> None:
+    """Raises `ConfigError` for a combination that cannot run, before anything is compiled."""
+    for name, allowed in CHOICES.items():
+        if getattr(config, name) not in allowed:
+            raise ConfigError(f"--{name} {getattr(config, name)!r}: unknown; choose one of {', '.join(allowed)}")
+    for name in (
+        "env_steps",
+        "num_envs",
+        "batch_size",
+        "generator_steps",
+        "discriminator_steps",
+        "cg_iterations",
+        "fisher_stride",
+        "line_search_steps",
+        "critic_epochs",
+        "critic_minibatch_size",
+    ):
+        if getattr(config, name) < 1:
+            raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")
+    if not config.hidden_sizes or min(config.hidden_sizes) < 1:
+        raise ConfigError(f"--hidden_sizes {config.hidden_sizes}: give at least one layer of at least one unit")
+    for name in field_names(traced=True):
+        value = getattr(config, name)
+        if value is not None and not (math.isfinite(value) and value >= 0):
+            raise ConfigError(f"--{name} {value}: must be finite and not negative")
+    for name in ("gamma", "gae_lambda"):
+        if getattr(config, name) > 1:
+            raise ConfigError(f"--{name} {getattr(config, name)}: must be at most 1")
+    if config.max_kl == 0:
+        raise ConfigError("--max_kl 0: the policy could never move; give a positive radius such as 0.01")
+    if config.batch_size % config.num_envs:
+        raise ConfigError(
+            f"--batch_size {config.batch_size} is not divisible by --num_envs {config.num_envs}; "
+            f"use --batch_size {config.batch_size // config.num_envs * config.num_envs or config.num_envs}"
+        )
+    if not 0 <= config.held_out_fraction < 1:
+        raise ConfigError(f"--held_out_fraction {config.held_out_fraction}: must be in [0, 1)")
+    if config.method == "malm" and config.meta_gradient != "none" and config.num_held_out == 0:
+        raise ConfigError(
+            f"--held_out_fraction {config.held_out_fraction}: malm's outer loss needs held-out samples; "
+            "use --held_out_fraction 0.3, or --meta_gradient none for the Lagrangian method"
+        )
+    if config.critic_minibatch_size > config.num_training:
+        raise ConfigError(
+            f"--critic_minibatch_size {config.critic_minibatch_size} exceeds the {config.num_training} training "
+            f"samples of a batch; use --critic_minibatch_size {config.num_training} or less"
+        )
+    if config.num_training < config.fisher_stride:
+        raise ConfigError(f"--fisher_stride {config.fisher_stride} exceeds the {config.num_training} training samples")
+    if config.method in PRESCRIBED_LIMIT_METHODS and config.cost_limit is None:
+        raise ConfigError(f"--cost_limit: method {config.method} needs a prescribed episode cost limit")

@@ -1,0 +1,197 @@
+"""How the cost enters the policy step: the part in which the methods differ.
+
+The policy step moves along `weights @ [x_r, x_c]`, the natural directions of the reward and the cost surrogate. A
+constraint chooses the weights (`combine`) and learns from the episode cost (`update`). `cost_gap` is J_k - J_E: the
+mean cost of finished episodes less the limit.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float
+
+from ccil_jax.config import Config
+from ccil_jax.types import Metrics, PyTree
+
+# The outer step may not push softplus(xi) lower: Adam moves xi by about its learning rate an update, and would need
+# hundreds of updates to come back.
+SMALLEST_SOFTPLUS_MULTIPLIER = 1e-3
+
+
+@struct.dataclass(kw_only=True)
+class Multiplier:
+    """The Lagrange multiplier; `parameter` is xi with lambda = softplus(xi), or lambda itself."""
+
+    parameter: jax.Array  # []
+    optimizer: PyTree
+
+
+@struct.dataclass(kw_only=True)
+class Outer:
+    """The outer (validation) loss of MALM on V held-out samples."""
+
+    reward_advantage: jax.Array  # [V]
+    cost: jax.Array  # [V]
+    importance_weights: Callable[[jax.Array], jax.Array] = struct.field(
+        pytree_node=False
+    )  # lambda -> pi_theta'(lambda)(a|s) / pi_theta_k(a|s), [V]
+
+
+@struct.dataclass(kw_only=True)
+class Episodes:
+    """What is known of the episode that each step of a batch belongs to, [T, N]."""
+
+    cost: jax.Array  # total if it finished within the batch, else extrapolated to a full-length episode
+    limit: jax.Array  # [] J_E
+
+
+class Constraint(NamedTuple):
+    """Pure functions. `entropy_in_cost`: steps may follow the cost alone, which must then carry the entropy bonus."""
+
+    init: Callable[[], PyTree]
+    multiplier: Callable[[PyTree], jax.Array]  # state -> lambda >= 0
+    gate: Callable[[jax.Array, jax.Array, Episodes], jax.Array]  # A_r, A_c, episodes -> A_r, all [T, N]
+    combine: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # lambda, cost_gap, gram [2, 2] -> weights [2]
+    update: Callable[[PyTree, jax.Array, Outer | None], tuple[PyTree, Metrics]]  # state, cost_gap, outer
+    entropy_in_cost: bool = False
+
+
+def _no_gate(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
+    return reward_advantage
+
+
+def unconstrained(config: Config) -> Constraint:
+    """The cost does not enter (GAIL, TRPO)."""
+    return Constraint(
+        init=lambda: (),
+        multiplier=lambda state: jnp.zeros(()),
+        gate=_no_gate,
+        combine=lambda multiplier, cost_gap, gram: jnp.array([1.0, 0.0]),
+        update=lambda state, cost_gap, outer: (state, {}),
+    )
+
+
+def lagrangian(config: Config) -> Constraint:
+    """Reward less lambda times cost, lambda by dual ascent on the cost gap (Algorithm 1 line 14)."""
+    dual, read, _ = _dual_ascent(config)
+    return Constraint(
+        init=lambda: _initial_multiplier(config),
+        multiplier=read,
+        gate=_no_gate,
+        combine=lambda multiplier, cost_gap, gram: jnp.stack([jnp.ones_like(multiplier), -multiplier]),
+        update=lambda state, cost_gap, outer: (dual(state, cost_gap), {}),
+    )
+
+
+def meta_lagrangian(config: Config) -> Constraint:
+    """`lagrangian`, then a gradient step of the outer loss (Algorithm 1 lines 15 and 16)."""
+    inner = lagrangian(config)
+    if config.meta_gradient == "none":
+        return inner
+    _, read, write = _dual_ascent(config)
+
+    def update(state: Multiplier, cost_gap: jax.Array, outer: Outer | None) -> tuple[Multiplier, Metrics]:
+        assert outer is not None, "the meta-gradient needs held-out samples"
+        after_dual, _ = inner.update(state, cost_gap, None)
+        gradient = outer_gradient(config.meta_gradient, read(state), read(after_dual), outer)
+        gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
+        stepped = write(after_dual, read(after_dual) - config.meta_learning_rate * gradient)
+        return stepped, {"meta_gradient": gradient}
+
+    return inner._replace(update=update)
+
+
+def outer_loss(
+    importance_weights: Float[Array, " V"],
+    reward_advantage: Float[Array, " V"],
+    cost: Float[Array, " V"],
+    multiplier: Float[Array, ""],
+) -> Float[Array, ""]:
+    """L = mean (w A_r - lambda' d)^2 on held-out samples (Algorithm 1 line 16)."""
+    return jnp.mean((importance_weights * reward_advantage - multiplier * cost) ** 2)
+
+
+def outer_gradient(
+    kind: str, multiplier: Float[Array, ""], after_dual: Float[Array, ""], outer: Outer
+) -> Float[Array, ""]:
+    """dL/dlambda' by forward mode through the inner policy step theta'(lambda), with d lambda / d lambda' = 1.
+
+    Args:
+        kind: "direct" holds theta' fixed with w = 1 (line 16 as printed); "indirect" is only the path through theta';
+            "full" is the total derivative.
+        multiplier: lambda, which shaped the inner step.
+        after_dual: lambda'.
+        outer: the held-out samples.
+    """
+    if kind == "direct":
+        ones = jnp.ones_like(outer.cost)
+        return jax.grad(outer_loss, argnums=3)(ones, outer.reward_advantage, outer.cost, after_dual)
+
+    def loss(multiplier: jax.Array, after_dual: jax.Array) -> jax.Array:
+        return outer_loss(outer.importance_weights(multiplier), outer.reward_advantage, outer.cost, after_dual)
+
+    one = jnp.ones_like(after_dual)
+    tangent = one if kind == "full" else jnp.zeros_like(after_dual)
+    return jax.jvp(loss, (multiplier, after_dual), (one, tangent))[1]
+
+
+def alternating(config: Config) -> Constraint:
+    """Ascend the reward while the cost is within the limit, else descend the cost (Algorithm 2 lines 8 to 11)."""
+
+    def by_batch(multiplier: jax.Array, cost_gap: jax.Array, gram: jax.Array) -> jax.Array:
+        return jnp.where(cost_gap <= 0, jnp.array([1.0, 0.0]), jnp.array([0.0, -1.0]))
+
+    def by_episode(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
+        mixed = jnp.where(episodes.cost <= episodes.limit, reward_advantage, -cost_advantage)
+        return (mixed - jnp.mean(mixed)) / (jnp.std(mixed) + 1e-8)
+
+    plain = unconstrained(config)
+    if config.gate == "episode":
+        return plain._replace(gate=by_episode)
+    return plain._replace(combine=by_batch, entropy_in_cost=True)
+
+
+def _initial_multiplier(config: Config) -> Multiplier:
+    initial = jnp.asarray(config.initial_multiplier, jnp.result_type(float))
+    parameter = inverse_softplus(initial) if config.multiplier_update == "adam" else initial
+    return Multiplier(parameter=parameter, optimizer=optax.adam(1.0).init(parameter))
+
+
+def inverse_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
+    """xi with softplus(xi) = value, for value >= SMALLEST_SOFTPLUS_MULTIPLIER (smaller values are raised to it)."""
+    value = jnp.maximum(value, SMALLEST_SOFTPLUS_MULTIPLIER)
+    return value + jnp.log(-jnp.expm1(-value))
+
+
+def _dual_ascent(
+    config: Config,
+) -> tuple[
+    Callable[[Multiplier, jax.Array], Multiplier],
+    Callable[[Multiplier], jax.Array],
+    Callable[[Multiplier, jax.Array], Multiplier],
+]:
+    """(dual step, read lambda, write lambda) of the configured parametrisation."""
+    optimizer = optax.adam(config.multiplier_learning_rate)
+
+    def clip(multiplier: jax.Array) -> jax.Array:
+        return jnp.clip(multiplier, 0.0, config.multiplier_max)
+
+    def adam(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
+        updates, optimizer_state = optimizer.update(-cost_gap, state.optimizer)
+        xi = state.parameter + jnp.asarray(updates)
+        # Beyond the cap xi would only wind up; softplus(xi) <= xi + log 2.
+        return Multiplier(parameter=jnp.minimum(xi, config.multiplier_max), optimizer=optimizer_state)
+
+    def sgd(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
+        return state.replace(parameter=clip(state.parameter + config.multiplier_learning_rate * cost_gap))
+
+    def read_softplus(state: Multiplier) -> jax.Array:
+        return clip(jax.nn.softplus(state.parameter))
+
+    if config.multiplier_update == "adam":
+        return adam, read_softplus, lambda state, value: state.replace(parameter=inverse_softplus(clip(value)))
+    return sgd, lambda state: state.parameter, lambda state, value: state.replace(parameter=clip(value))

@@ -1,0 +1,160 @@
+"""Whole episodes of a fixed policy: evaluation, recording of demonstrations, and the random policy."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from ccil_jax import networks
+from ccil_jax.config import Config
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.rollout import Actor, act
+from envs.base import Environment, State
+
+
+@struct.dataclass(kw_only=True)
+class Evaluation:
+    """Undiscounted totals of whole episodes; NumPy arrays [num_seeds, num_episodes]."""
+
+    episode_return: Any
+    episode_cost: Any
+    episode_length: Any  # steps
+
+
+@struct.dataclass(kw_only=True)
+class Episodes:
+    """Steps [T, N] of N episodes side by side; `valid` is false after an episode's end."""
+
+    obs: jax.Array
+    action: jax.Array  # as executed: clipped to the environment's range
+    reward: jax.Array
+    cost: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    valid: jax.Array
+
+
+Act = Callable[[jax.Array, jax.Array], jax.Array]  # obs [N, obs_dim], key -> action [N, action_dim]
+
+
+def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Array) -> Episodes:
+    """Runs `num_episodes` episodes side by side from fresh resets to their ends."""
+    reset_key, key = jax.random.split(key)
+    start = jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes))
+
+    def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple[State, jax.Array], Episodes]:
+        state, running = carry
+        action = jnp.clip(policy(state.obs, key), jnp.asarray(env.action_low), jnp.asarray(env.action_high))
+        stepped = jax.vmap(env.step)(state, action)
+        episodes = Episodes(
+            obs=state.obs,
+            action=action,
+            reward=stepped.reward,
+            cost=stepped.cost,
+            terminated=stepped.terminated,
+            truncated=stepped.truncated,
+            valid=running,
+        )
+        return (stepped, running & ~stepped.done), episodes
+
+    running = jnp.ones(num_episodes, bool)
+    keys = jax.random.split(key, env.max_episode_steps)
+    return jax.lax.scan(step, (start, running), keys)[1]
+
+
+def _gaussian(config: Config, env: Environment, actor: Actor, deterministic: bool) -> Act:
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim)
+
+    def policy_act(obs: jax.Array, key: jax.Array) -> jax.Array:
+        shape = (*obs.shape[:-1], env.action_dim)
+        noise = jnp.zeros(shape) if deterministic else jax.random.normal(key, shape)
+        return act(policy.apply, actor, obs, noise)
+
+    return policy_act
+
+
+def _uniform(env: Environment) -> Act:
+    low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
+
+    def policy_act(obs: jax.Array, key: jax.Array) -> jax.Array:
+        return jax.random.uniform(key, (*obs.shape[:-1], env.action_dim), minval=low, maxval=high)
+
+    return policy_act
+
+
+def _totals(episodes: Episodes) -> Evaluation:
+    return Evaluation(
+        episode_return=jnp.sum(episodes.reward * episodes.valid, axis=0),
+        episode_cost=jnp.sum(episodes.cost * episodes.valid, axis=0),
+        episode_length=jnp.sum(episodes.valid, axis=0),
+    )
+
+
+def evaluate(
+    config: Config,
+    actor: Actor,
+    env: Environment,
+    *,
+    num_episodes: int = 50,
+    seed: int = 0,
+    deterministic: bool = False,
+) -> Evaluation:
+    """Return, cost and length of `num_episodes` fresh episodes for every seed of `actor` ([S]-leading).
+
+    The policy acts stochastically, as it was trained, unless `deterministic`. All seeds see the same random numbers.
+    """
+    key = jax.random.key(seed)
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(0, None))
+    def run(actor: Actor, key: jax.Array) -> Evaluation:
+        return _totals(run_episodes(env, _gaussian(config, env, actor, deterministic), num_episodes, key))
+
+    return jax.tree.map(np.asarray, run(actor, key))
+
+
+def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) -> Evaluation:
+    """The same for uniformly random actions; arrays are [1, num_episodes]."""
+
+    @jax.jit
+    def run(key: jax.Array) -> Evaluation:
+        return _totals(run_episodes(env, _uniform(env), num_episodes, key))
+
+    return jax.tree.map(lambda x: np.asarray(x)[None], run(jax.random.key(seed)))
+
+
+def record(
+    config: Config,
+    actor: Actor,
+    env: Environment,
+    *,
+    num_episodes: int,
+    seed: int = 0,
+    metadata: dict[str, Any] | None = None,
+) -> Demonstrations:
+    """Demonstrations of one policy (no seed axis), acting stochastically. Actions are recorded as executed."""
+
+    @jax.jit
+    def run(actor: Actor, key: jax.Array) -> Episodes:
+        return run_episodes(env, _gaussian(config, env, actor, False), num_episodes, key)
+
+    episodes = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
+    keep = episodes.valid.T  # [N, T]: episode after episode
+
+    def flat(x: np.ndarray) -> np.ndarray:
+        return np.swapaxes(x, 0, 1)[keep]
+
+    return Demonstrations(
+        obs=flat(episodes.obs).astype(np.float32),
+        actions=flat(episodes.action).astype(np.float32),
+        rewards=flat(episodes.reward).astype(np.float32),
+        costs=flat(episodes.cost).astype(np.float32),
+        terminated=flat(episodes.terminated),
+        truncated=flat(episodes.truncated),
+        episode_ends=np.cumsum(keep.sum(axis=1)),
+        metadata=metadata or {},
+    )

@@ -1,0 +1,73 @@
+"""The three networks: Gaussian policy, critic and discriminator. The rest of the package sees only init and apply."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ccil_jax.config import Config
+from ccil_jax.distributions import Gaussian
+from ccil_jax.types import PyTree
+
+ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
+
+
+class MLP(nn.Module):
+    """Fully connected network; `final_scale` shrinks the initial last layer."""
+
+    sizes: Sequence[int]
+    activation: Callable[[jax.Array], jax.Array]
+    final_scale: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for size in self.sizes[:-1]:
+            x = self.activation(nn.Dense(size, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
+        return nn.Dense(self.sizes[-1], kernel_init=nn.initializers.orthogonal(self.final_scale))(x)
+
+
+class Network(NamedTuple):
+    """A pair of pure functions."""
+
+    init: Callable[[jax.Array], PyTree]
+    apply: Callable[..., jax.Array]
+
+
+class Policy(NamedTuple):
+    """`init(key) -> params`; `apply(params, normalized_obs) -> Gaussian`."""
+
+    init: Callable[[jax.Array], PyTree]
+    apply: Callable[[PyTree, jax.Array], Gaussian]
+
+
+def _mlp(config: Config, out: int, final_scale: float) -> MLP:
+    return MLP((*config.hidden_sizes, out), ACTIVATIONS[config.activation], final_scale)
+
+
+def make_policy(config: Config, obs_dim: int, action_dim: int) -> Policy:
+    """Gaussian policy: mean from an MLP whose last layer starts small, log-std a free vector from 0 (authors)."""
+    mlp = _mlp(config, action_dim, final_scale=0.01)
+
+    def init(key: jax.Array) -> PyTree:
+        return {"mean": mlp.init(key, jnp.zeros((1, obs_dim))), "log_std": jnp.zeros(action_dim)}
+
+    def apply(params: PyTree, obs: Float[Array, "... D"]) -> Gaussian:
+        return Gaussian(mean=mlp.apply(params["mean"], obs), log_std=params["log_std"])
+
+    return Policy(init, apply)
+
+
+def make_scalar(config: Config, input_dim: int) -> Network:
+    """A critic or discriminator: [..., input_dim] -> [...]."""
+    mlp = _mlp(config, 1, final_scale=1.0)
+
+    def init(key: jax.Array) -> PyTree:
+        return mlp.init(key, jnp.zeros((1, input_dim)))
+
+    def apply(params: PyTree, x: Float[Array, "... D"]) -> Float[Array, "..."]:
+        return mlp.apply(params, x)[..., 0]
+
+    return Network(init, apply)

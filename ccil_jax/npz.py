@@ -1,0 +1,129 @@
+"""`.npz` archives from strangers: read without pickle, within a size limit, and written whole or not at all.
+
+NumPy's own loader would run code hidden in object arrays if asked to, and believes headers that lie about their size.
+"""
+
+import contextlib
+import io
+import lzma
+import os
+import struct
+import tempfile
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+MAX_BYTES = 2 * 1024**3  # of all arrays together, unpacked: a small archive can unpack to terabytes
+
+_DAMAGE = (  # what a hostile archive can raise out of zipfile, zlib, struct, ast and NumPy
+    ArithmeticError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    lzma.LZMAError,
+    struct.error,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+class ArchiveError(ValueError):
+    """An archive that cannot be read. The message is one line: file, key, remedy."""
+
+
+def read(
+    path: Path, keys: Iterable[str], *, optional: frozenset[str] = frozenset(), remedy: str
+) -> dict[str, np.ndarray]:
+    """The arrays named `keys`, optional ones only where present. Runs no code and unpacks at most `MAX_BYTES`.
+
+    Raises `ArchiveError`; `remedy` ends the messages about archives of a wrong kind.
+    """
+    _check_kind(path, remedy)
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename: info for info in archive.infolist()}
+            total = sum(info.file_size for info in members.values())
+            if total > MAX_BYTES:
+                raise ArchiveError(f"{path}: unpacks to {total} bytes, limit {MAX_BYTES}; use fewer episodes")
+            for key in keys:
+                info = members.get(f"{key}.npy")
+                if info is not None:
+                    arrays[key] = _read_array(archive, info, f"{path}: '{key}'", remedy)
+                elif key not in optional:
+                    raise ArchiveError(f"{path}: key '{key}' is missing; {remedy}")
+    except ArchiveError:
+        raise
+    except OSError as error:
+        raise ArchiveError(f"{path}: cannot be read ({error.strerror}); check the path and rights") from None
+    except _DAMAGE:
+        raise ArchiveError(f"{path}: truncated or damaged .npz archive; copy or record it again") from None
+    return arrays
+
+
+def write(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Writes a compressed archive, whole or not at all; equal arrays give equal bytes. Raises `OSError`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        os.chmod(temporary, 0o644)  # mkstemp's 0600 would hide a shared file from its readers
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise
+
+
+def _check_kind(path: Path, remedy: str) -> None:
+    if not path.exists():
+        raise ArchiveError(f"{path}: no such file; check the path")
+    if not path.is_file():
+        raise ArchiveError(f"{path}: not a file; give the .npz file itself")
+    try:
+        with path.open("rb") as file:
+            start = file.read(2)
+    except OSError as error:
+        raise ArchiveError(f"{path}: cannot be read ({error.strerror}); check its permissions") from None
+    if not start:
+        raise ArchiveError(f"{path}: the file is empty (0 bytes); copy or record it again")
+    if start[:1] == b"\x80":
+        raise ArchiveError(f"{path}: a pickle, refused because it could execute code; {remedy}")
+    if start != b"PK":
+        raise ArchiveError(f"{path}: not an .npz archive; {remedy}")
+
+
+def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str, remedy: str) -> np.ndarray:
+    """One member as an array, once its header has been found to agree with its size."""
+    try:
+        content = io.BytesIO(archive.read(info))
+        version = np.lib.format.read_magic(content)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran_order, dtype = read_header(content)
+        if not dtype.hasobject and len(content.getbuffer()) - content.tell() == _num_bytes(shape, dtype):
+            order: Any = "F" if fortran_order else "C"
+            return np.ndarray(shape, dtype, buffer=content.getbuffer(), offset=content.tell(), order=order)
+    except _DAMAGE:
+        raise ArchiveError(f"{where} is truncated or damaged; copy or record the file again") from None
+    if dtype.hasobject:
+        raise ArchiveError(f"{where} holds pickled objects, refused because they could execute code; {remedy}")
+    raise ArchiveError(f"{where} declares shape {shape}, which is not what the file holds; record it again")
+
+
+def _num_bytes(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    size = dtype.itemsize
+    for length in shape:
+        size *= int(length)
+    return size

@@ -1,0 +1,211 @@
+"""Training: one compiled program over all seeds, and the loop that logs and checkpoints between its chunks."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ccil_jax import on_policy
+from ccil_jax.checkpointing import Checkpointer
+from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, validate
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.on_policy import AgentState
+from ccil_jax.rollout import Actor
+from ccil_jax.types import ExpertData, Metrics
+from envs.base import Environment
+
+LONGEST_CHUNK = 10  # iterations between two looks from Python
+CHECKPOINT_SECONDS = 60.0  # at most this much work is lost, plus one chunk
+
+History = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Progress:
+    """What `on_progress` sees after every chunk."""
+
+    iteration: int  # finished so far
+    num_iterations: int
+    metrics: History  # the new rows, [chunk, num_seeds] each
+    env_steps_per_second: float  # of this chunk, all seeds together
+    compile_seconds: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Result:
+    """A finished (or stopped) run."""
+
+    config: Config  # as resolved: cost_limit is set
+    metrics: History  # [iterations, num_seeds] each
+    state: AgentState  # [num_seeds]-leading
+    env_steps: int  # per seed
+    compile_seconds: float
+    wall_seconds: float  # of this call, compilation included
+
+    @property
+    def agent(self) -> Actor:
+        """Policies and observation statistics, [num_seeds]-leading."""
+        return self.state.actor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Program:
+    """The compiled functions of one configuration."""
+
+    init: Callable[[jax.Array], AgentState]  # keys [S] -> state
+    state: AgentState  # shapes and dtypes
+    chunk: Callable[[AgentState], tuple[AgentState, Metrics]]  # state (donated) -> state, metrics [S, chunk_length]
+    chunk_length: int
+    compile_seconds: float
+
+
+def resolve(config: Config, env: Environment, demonstrations: Demonstrations | None) -> Config:
+    """Checks that the pieces fit and sets the cost limit. Raises `ConfigError` before anything is compiled."""
+    if config.method in IMITATION_METHODS:
+        if demonstrations is None:
+            raise ConfigError(f"method {config.method} needs demonstrations; pass some, or use method trpo or expert")
+        for name, array, size in (
+            ("obs", demonstrations.obs, env.obs_dim),
+            ("actions", demonstrations.actions, env.action_dim),
+        ):
+            if array.shape[1] != size:
+                raise ConfigError(f"demonstrations: {name} has {array.shape[1]} columns but {env.name} has {size}")
+    if config.method in IMITATION_METHODS - PRESCRIBED_LIMIT_METHODS and demonstrations is not None:
+        config = config.replace(cost_limit=float(demonstrations.mean_episode_cost))
+    elif config.cost_limit is None and config.method not in PRESCRIBED_LIMIT_METHODS:
+        config = config.replace(cost_limit=0.0)  # enters nothing
+    validate(config)
+    return config
+
+
+def expert_data(demonstrations: Demonstrations | None) -> ExpertData | None:
+    """Demonstrations as device arrays; the last tenth of the steps is held out from the discriminator."""
+    if demonstrations is None:
+        return None
+    num_training = max(1, demonstrations.obs.shape[0] * 9 // 10)
+    held_out = slice(min(num_training, demonstrations.obs.shape[0] - 1), None)
+    return ExpertData(
+        obs=jnp.asarray(demonstrations.obs[:num_training]),
+        action=jnp.asarray(demonstrations.actions[:num_training]),
+        held_out_obs=jnp.asarray(demonstrations.obs[held_out]),
+        held_out_action=jnp.asarray(demonstrations.actions[held_out]),
+    )
+
+
+def compile_program(config: Config, env: Environment, expert: ExpertData | None, num_seeds: int) -> Program:
+    """`jit(vmap(scan(iteration)))` over seeds, compiled once. `config` must be resolved."""
+    chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if config.num_iterations % n == 0)
+
+    def init(config: Config, expert: ExpertData | None, keys: jax.Array) -> AgentState:
+        return jax.vmap(on_policy.make(config, env, expert).init)(keys)
+
+    def chunk(config: Config, expert: ExpertData | None, state: AgentState) -> tuple[AgentState, Metrics]:
+        agent = on_policy.make(config, env, expert)
+
+        def iterate(state: AgentState) -> tuple[AgentState, Metrics]:
+            return jax.lax.scan(lambda state, _: agent.step(state), state, None, length=chunk_length)
+
+        return jax.vmap(iterate)(state)
+
+    start = time.perf_counter()
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), num_seeds))
+    compiled_init = jax.jit(init).lower(config, expert, keys).compile()
+    state = jax.eval_shape(init, config, expert, keys)
+    compiled_chunk = jax.jit(chunk, donate_argnums=2).lower(config, expert, state).compile()
+    return Program(
+        init=lambda keys: compiled_init(config, expert, keys),
+        state=state,
+        chunk=lambda state: compiled_chunk(config, expert, state),
+        chunk_length=chunk_length,
+        compile_seconds=time.perf_counter() - start,
+    )
+
+
+def train(
+    config: Config,
+    env: Environment,
+    demonstrations: Demonstrations | None = None,
+    *,
+    num_seeds: int = 1,
+    seed: int = 0,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+    stop_after: int | None = None,
+) -> Result:
+    """Trains `config.method` with `num_seeds` seeds in one vmapped program.
+
+    Args:
+        config: hyperparameters; its cost limit is taken from the demonstrations where the method says so.
+        env: one environment, unbatched.
+        demonstrations: needed by the imitation methods.
+        num_seeds: S.
+        seed: of the S keys; the same seed and S give the same bits.
+        checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
+        resume: continue from the newest checkpoint in `checkpoint_dir`.
+        on_progress: called after every chunk of iterations.
+        stop_after: stop once this many iterations are done (a multiple of the chunk), to be resumed later.
+
+    Raises:
+        ConfigError: options, environment and demonstrations do not fit together.
+    """
+    start = time.perf_counter()
+    config = resolve(config, env, demonstrations)
+    if num_seeds < 1:
+        raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
+    program = compile_program(config, env, expert_data(demonstrations), num_seeds)
+    keys = jax.random.split(jax.random.key(seed), num_seeds)
+    last = min(stop_after or config.num_iterations, config.num_iterations)
+
+    with contextlib.ExitStack() as stack:
+        checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
+        done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
+        if checkpoints and done:
+            saved = checkpoints.restore(done, {"state": program.state, "history": checkpoints.structure(done)["history"]})
+            state, history = saved["state"], saved["history"]
+        else:
+            state, history = program.init(keys), {}
+        saved_at = time.perf_counter()
+        while done < last:
+            chunk_start = time.perf_counter()
+            state, metrics = program.chunk(state)
+            rows = _rows(metrics, done, config)
+            elapsed = time.perf_counter() - chunk_start
+            history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
+            done += program.chunk_length
+            if checkpoints and (done >= last or time.perf_counter() - saved_at > CHECKPOINT_SECONDS):
+                checkpoints.save(done, {"state": state, "history": history})
+                saved_at = time.perf_counter()
+            if on_progress:
+                rate = program.chunk_length * config.steps_per_iteration * num_seeds / elapsed
+                on_progress(
+                    Progress(
+                        iteration=done,
+                        num_iterations=config.num_iterations,
+                        metrics=rows,
+                        env_steps_per_second=rate,
+                        compile_seconds=program.compile_seconds,
+                    )
+                )
+    return Result(
+        config=config,
+        metrics=history,
+        state=state,
+        env_steps=done * config.steps_per_iteration,
+        compile_seconds=program.compile_seconds,
+        wall_seconds=time.perf_counter() - start,
+    )
+
+
+def _rows(metrics: Metrics, done: int, config: Config) -> History:
+    """Metrics of a chunk [S, chunk] as rows [chunk, S], with the step counter."""
+    rows = {name: np.asarray(value).T for name, value in metrics.items()}
+    length, num_seeds = next(iter(rows.values())).shape
+    # Counted on the host: a 32-bit counter would overflow.
+    env_steps = np.arange(done + 1, done + length + 1, dtype=np.int64) * config.steps_per_iteration
+    return {"env_steps": np.tile(env_steps[:, None], (1, num_seeds)), **rows}

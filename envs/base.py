@@ -1,0 +1,56 @@
+"""The contract between environments and learners.
+
+An environment is a set of pure functions of one simulation; callers `vmap` them.
+Auto-reset is not here: `ccil_jax.rollout` owns it, so `step` always returns the true successor.
+"""
+
+from typing import Any, Protocol
+
+import jax
+from flax import struct
+
+PyTree = Any
+
+
+@struct.dataclass(kw_only=True)
+class State:
+    """One simulation between two control steps. All fields are scalars or per-simulation arrays."""
+
+    physics: PyTree  # whatever the environment needs to continue exactly
+    obs: jax.Array  # [obs_dim]
+    reward: jax.Array  # [] of the last step; 0 after reset
+    cost: jax.Array  # [] of the last step, >= 0; 0 after reset
+    terminated: jax.Array  # [] bool: the task ended (no bootstrap)
+    truncated: jax.Array  # [] bool: the time limit was reached (bootstrap from `obs`)
+    step_count: jax.Array  # [] int32: counts towards the time limit
+    episode_return: jax.Array  # [] undiscounted sum of reward since reset
+    episode_cost: jax.Array  # [] undiscounted sum of cost since reset
+    terms: dict[str, jax.Array]  # [] each: the named summands of reward, same keys at reset and step
+
+    @property
+    def done(self) -> jax.Array:
+        """[] bool: the episode is over, for either reason."""
+        return self.terminated | self.truncated
+
+
+class Environment(Protocol):
+    """What a learner may assume. Actions outside `[action_low, action_high]` are clipped by `step`."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def obs_dim(self) -> int: ...
+    @property
+    def action_dim(self) -> int: ...
+    @property
+    def action_low(self) -> jax.typing.ArrayLike: ...
+    @property
+    def action_high(self) -> jax.typing.ArrayLike: ...
+    @property
+    def max_episode_steps(self) -> int: ...
+
+    def reset(self, key: jax.Array) -> State:
+        """Starts an episode from the task's own random distribution. `key` is consumed."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one control step. `action` is `[action_dim]`; stepping a done state is undefined."""
