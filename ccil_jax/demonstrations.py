@@ -95,7 +95,7 @@ class Demonstrations:
         if not 1 <= count <= self.num_episodes:
             raise DemonstrationsError(f"{count} trajectories asked for; choose between 1 and {self.num_episodes}")
         end = int(self.episode_ends[count - 1])
-        steps = {key: None if (v := getattr(self, key)) is None else v[:end] for key in _STEP_KEYS}
+        steps: dict[str, Any] = {key: None if (v := getattr(self, key)) is None else v[:end] for key in _STEP_KEYS}
         return Demonstrations(**steps, episode_ends=self.episode_ends[:count], metadata=dict(self.metadata))
 
     def _episode_sums(self, values: np.ndarray) -> np.ndarray:
@@ -163,7 +163,7 @@ def _parse_metadata(array: np.ndarray, path: Path) -> dict[str, Any]:
 
 def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
     """The arrays, in their final types, as sound `Demonstrations`; `source` begins every complaint."""
-    converted = {key: _convert(arrays[key], key, source) for key in _RANKS if arrays[key] is not None}
+    converted: dict[str, Any] = {key: _convert(arrays[key], key, source) for key in _RANKS if arrays[key] is not None}
     num_steps = len(converted["obs"])
     if num_steps == 0:
         raise DemonstrationsError(f"{source}: 'obs' is empty; record at least one episode")

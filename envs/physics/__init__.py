@@ -1,0 +1,52 @@
+"""Interchangeable physics: one pure `step`, several engines. `make_physics` chooses."""
+
+from collections.abc import Sequence
+
+import jax
+import mujoco
+
+from envs.physics.base import Data, Physics
+
+__all__ = ["Data", "Physics", "make_physics", "resolve"]
+
+
+def resolve(name: str) -> str:
+    """What "auto" stands for: "native" where JAX's default backend is the CPU, "mjx" elsewhere. Other names pass."""
+    if name != "auto":
+        return name
+    return "native" if jax.default_backend() == "cpu" else "mjx"
+
+
+def make_physics(
+    name: str,
+    model: mujoco.MjModel,
+    *,
+    num_substeps: int,
+    fields: Sequence[str] = (),
+    track: Sequence[str] = (),
+    num_threads: int | None = None,
+) -> Physics:
+    """Builds a backend.
+
+    Args:
+        name: "auto", "native", "mjx" or "warp".
+        model: the compiled model; the backend does not modify it.
+        num_substeps: engine steps per control step.
+        fields: derived `MjData` arrays that `Data.fields` shall hold, e.g. "cfrc_ext".
+        track: `MjData` arrays whose change over the control step `Data.change` shall hold, e.g. "qpos".
+        num_threads: of `native`; None takes all usable CPUs. The other backends ignore it.
+
+    Raises:
+        ValueError: unknown name.
+        ImportError: "warp" without the extra `mujoco-mjx[warp]`.
+    """
+    name = resolve(name)
+    if name == "native":
+        from envs.physics.native import NativePhysics
+
+        return NativePhysics(model, num_substeps, fields=fields, track=track, num_threads=num_threads)
+    if name in ("mjx", "warp"):
+        from envs.physics.mjx import MjxPhysics
+
+        return MjxPhysics(model, num_substeps, fields=fields, track=track, impl="jax" if name == "mjx" else "warp")
+    raise ValueError(f"unknown physics {name!r}: choose one of auto, native, mjx, warp")

@@ -1,0 +1,37 @@
+"""The physics interface: what an environment may know of an engine."""
+
+from typing import Any, Protocol
+
+import jax
+from flax import struct
+
+PyTree = Any
+
+
+@struct.dataclass(kw_only=True)
+class Data:
+    """One simulation between two control steps.
+
+    Derived `fields` are what the engine leaves after a step, as in MuJoCo itself: one substep behind `qpos` and
+    `qvel` (with RK4, of its last stage). `change` has the tracked quantities after the control step minus before,
+    taken at the engine's precision: at x = 100 m a float32 difference of positions would keep no more than 1e-5 m.
+    """
+
+    qpos: jax.Array  # [nq]
+    qvel: jax.Array  # [nv]
+    fields: dict[str, jax.Array]  # the derived arrays asked for, shaped as in `MjData`
+    change: dict[str, jax.Array]  # tracked quantities, shaped as in `MjData`; zero after `init`
+    backend: PyTree  # all the engine needs to continue; opaque
+
+
+class Physics(Protocol):
+    """Pure functions of one simulation; callers vmap them. Same values in, same values out."""
+
+    @property
+    def name(self) -> str: ...
+
+    def init(self, qpos: jax.Array, qvel: jax.Array) -> Data:
+        """A simulation at rest in time at `qpos` `[nq]`, `qvel` `[nv]`, without a warm start."""
+
+    def step(self, data: Data, ctrl: jax.Array) -> Data:
+        """Advances one control step (all its substeps) under constant `ctrl` `[nu]`."""

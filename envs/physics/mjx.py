@@ -1,0 +1,139 @@
+"""MJX: MuJoCo in JAX. The default on accelerators; differentiable; `impl="warp"` is its NVIDIA-only variant."""
+
+import contextlib
+import copy
+import importlib
+import importlib.util
+import io
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+
+from envs.physics.base import Data
+from envs.physics.mjx_patch import align_plane_capsule_frames
+
+# MJX-Warp allots contacts for all simulations together: 32 each for 8,192.
+_WARP_MAX_CONTACTS = 32 * 8192
+
+
+@struct.dataclass(kw_only=True)
+class _Carry:
+    """What MJX needs to continue. All else in its `Data` is computed anew from these by the next step."""
+
+    qpos: jax.Array  # [nq]
+    qvel: jax.Array  # [nv]
+    qacc_warmstart: jax.Array  # [nv]
+    tracked: dict[str, jax.Array]  # derived quantities after the last control step
+
+
+class MjxPhysics:
+    """See `Physics`. Models without activations, mocap bodies or actuator history.
+
+    The solver is the model's own, but for PGS (Humanoid), which MJX lacks: Newton takes its place and differs by
+    4e-10 in a step's velocity (median). The native backend keeps PGS, for parity with gymnasium.
+
+    Building one corrects MJX's plane-capsule contacts for the whole process; see `mjx_patch.py`.
+
+    Args:
+        model: any model that MJX loads.
+        num_substeps: engine steps per control step.
+        fields: derived `MjData` arrays for `Data.fields`; "cfrc_ext" only with impl "jax". If there are any, or
+            derived arrays in `track`, `init` runs the forward pass.
+        track: `MjData` arrays for `Data.change`; in float32 unless x64 is enabled.
+        impl: "jax" or "warp". Warp is not bit-deterministic.
+
+    Raises:
+        ImportError: impl "warp" without the package warp.
+        ValueError: a field that the implementation does not compute.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_substeps: int,
+        *,
+        fields: Sequence[str] = (),
+        track: Sequence[str] = (),
+        impl: str = "jax",
+    ):
+        self.name = "mjx" if impl == "jax" else impl
+        if impl == "warp" and importlib.util.find_spec("warp") is None:
+            raise ImportError("physics 'warp' needs the package warp: pip install 'mujoco-mjx[warp]'")
+        if impl == "warp" and "cfrc_ext" in fields:
+            raise ValueError("physics 'warp' computes no contact forces: pass contact_cost=False")
+        self._mjx = mjx = import_mjx()
+        align_plane_capsule_frames()
+        if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
+            model = copy.copy(model)
+            model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        limits = {"naconmax": _WARP_MAX_CONTACTS} if impl == "warp" else {}
+        self._model = mjx.put_model(model, impl=impl)
+        # Strongly typed: MJX's `time` is a weak float, which would make every scan over it trace twice.
+        self._template = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), mjx.make_data(model, impl=impl, **limits))
+        self._num_substeps = num_substeps
+        self._fields, self._track = tuple(fields), tuple(track)
+        self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in ("qpos", "qvel")))
+        self._forces = "cfrc_ext" in fields
+
+    def init(self, qpos: jax.Array, qvel: jax.Array) -> Data:
+        """See `Physics.init`."""
+        template = self._template
+        data = template.replace(
+            qpos=jnp.asarray(qpos, template.qpos.dtype), qvel=jnp.asarray(qvel, template.qvel.dtype)
+        )
+        if self._derived:
+            data = self._mjx.forward(self._model, data)
+        return self._pack(data, {n: jnp.zeros_like(read(data, n)) for n in self._track})
+
+    def step(self, data: Data, ctrl: jax.Array) -> Data:
+        """See `Physics.step`."""
+        carry = data.backend
+        before = carry.tracked | {"qpos": carry.qpos, "qvel": carry.qvel}
+        state = self._template.replace(
+            qpos=carry.qpos,
+            qvel=carry.qvel,
+            qacc_warmstart=carry.qacc_warmstart,
+            ctrl=jnp.asarray(ctrl, self._template.ctrl.dtype),
+        )
+
+        def substep(state: Any, _: None) -> tuple[Any, None]:
+            new = self._mjx.step(self._model, state)
+            # With x64, MJX 3.17 changes the integer types of tendon arrays: a scan's carry must keep its types.
+            return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), new, state), None
+
+        state, _ = jax.lax.scan(substep, state, None, length=self._num_substeps)
+        if self._forces:
+            state = self._mjx.rne_postconstraint(self._model, state)
+        return self._pack(state, {n: read(state, n) - before[n] for n in self._track})
+
+    def _pack(self, data: Any, change: dict[str, jax.Array]) -> Data:
+        tracked = {n: read(data, n) for n in self._track if n not in ("qpos", "qvel")}
+        return Data(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            fields={n: read(data, n) for n in self._fields},
+            change=change,
+            backend=_Carry(qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart, tracked=tracked),
+        )
+
+
+def read(data: Any, name: str) -> jax.Array:
+    """An array of `mjx.Data`, from its public part or from its implementation's (where cinert, cfrc_ext are)."""
+    public = any(field.name == name for field in type(data).fields())
+    return getattr(data if public else data._impl, name)
+
+
+def import_mjx() -> Any:
+    """`mujoco.mjx`, without the line that its import prints where the optional package warp is missing."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        module = importlib.import_module("mujoco.mjx")
+    for line in printed.getvalue().splitlines(keepends=True):
+        if not line.startswith("Failed to import"):
+            sys.stdout.write(line)
+    return module

@@ -1,0 +1,133 @@
+"""Measures physics, rollouts, whole training and the meta-gradient, and prints a table with their ratios.
+
+Every row runs in a process of its own (so that peak memory is that row's); within a row the measurements are taken in
+turn, and medians are reported, so that other work on the machine spoils a round rather than a ratio.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.config import METHOD_NAMES, PRESETS
+from envs.registry import PHYSICS
+from experiments import command_line, options, run_folder
+from experiments.command_line import Parser, UsageError
+from experiments.summary import show
+
+
+def make_parser() -> Parser:
+    """The options of this launcher."""
+    parser = Parser("benchmark", __doc__ or "")
+    positive = command_line.positive
+    parser.add_argument("--tasks", nargs="+", default=["Swimmer", "HalfCheetah"], metavar="TASK", help="task names")
+    parser.add_argument(
+        "--num-seeds", nargs="+", type=positive, default=[1, 8], metavar="S", help="one row for each (default: 1 8)"
+    )
+    parser.add_argument("--num-envs", type=positive, default=16, metavar="N", help="per seed (default: 16)")
+    parser.add_argument("--method", default="malm", choices=METHOD_NAMES, help="what is trained (default: malm)")
+    parser.add_argument("--physics", default="auto", choices=PHYSICS, help="engine (default: auto)")
+    parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="hyperparameters (default: paper)")
+    parser.add_argument("--quick", action="store_true", help="fewer and shorter measurements, for a first look")
+    parser.add_argument("--seed", default=0, type=command_line.natural, metavar="N", help="base seed (default: 0)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("benchmark.json"), metavar="FILE", help="result file (default: benchmark.json)"
+    )
+    parser.add_argument("--row", help=argparse.SUPPRESS)  # a setting as JSON: measure it here and print the result
+    return parser
+
+
+def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """One setting (see `measuring.Setting`) per row. Raises `UsageError` or `ConfigError` for wrong input."""
+    method = {"method": arguments.method, "num_envs": arguments.num_envs, "cost_limit": 0.0}
+    options.config_from(method, arguments.preset)
+    return [
+        {
+            "task": options.find_task(task, "--tasks").name,
+            "physics": arguments.physics,
+            "method": arguments.method,
+            "num_seeds": num_seeds,
+            "num_envs": arguments.num_envs,
+            "preset": arguments.preset,
+            "rounds": 2 if arguments.quick else 5,
+            "seconds": 0.3 if arguments.quick else 2.0,
+            "seed": arguments.seed,
+        }
+        for task in arguments.tasks
+        for num_seeds in arguments.num_seeds
+    ]
+
+
+def measure_row(setting: dict[str, Any]) -> dict[str, Any]:
+    """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
+    command = [sys.executable, "-m", "experiments.benchmark", "--row", json.dumps(setting)]
+    path = os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path})
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+        raise UsageError(
+            f"--tasks {setting['task']}, --num-seeds {setting['num_seeds']}: cannot be measured: {last[0]}"
+        )
+    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return row
+
+
+def print_rows(rows: Sequence[dict[str, Any]]) -> None:
+    """The rows as a terminal table."""
+    from rich.table import Table
+
+    table = Table(title="control steps per second, all seeds together", title_justify="left")
+    for title in ("task", "seeds x envs", "physics alone", "rollout", "training"):
+        table.add_column(title, justify="left" if title == "task" else "right", no_wrap=True)
+    for title in ("training / physics", "meta-gradient / policy step", "compile, s", "peak, MiB"):
+        table.add_column(title, justify="right")
+    for row in rows:
+        rates = [row[f"{name}_steps_per_second"] for name in ("physics", "rollout", "training")]
+        table.add_row(
+            f"{row['task']} ({row['physics']})",
+            f"{row['num_seeds']} x {row['num_envs']}",
+            *(f"{rate:,.0f}" for rate in rates),
+            f"{row['training_to_physics']:.2f}",
+            f"{row['meta_gradient_to_policy_step']:.2f}",
+            f"{row['compile_seconds']:.1f}",
+            f"{row['peak_memory_mib']:,.0f}",
+        )
+    show(table)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures all rows, prints and writes them."""
+    if arguments.row is not None:
+        from experiments import measuring  # imports JAX
+
+        print(json.dumps(measuring.measure(measuring.Setting(**json.loads(arguments.row)))))
+        return
+    settings = settings_of(arguments)
+    command_line.check_writable(arguments.out.parent, "--out")
+    rows = []
+    for setting in settings:
+        print(f"measuring {setting['task']}, {setting['num_seeds']} seed(s) ...", file=sys.stderr, flush=True)
+        rows.append(measure_row(setting))
+    print_rows(rows)
+    facts = {
+        "command": command_line.command(),
+        "versions": run_folder.versions(),
+        "git_commit": run_folder.git_commit(),
+        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load_average": os.getloadavg(),
+    }
+    run_folder.write_json(arguments.out, {**facts, "rows": rows})
+    print(f"written to {arguments.out}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""What every launcher shares: one-line errors with exit status 2, and checks of output folders.
+
+Nothing here imports JAX, so help and wrong input are answered at once.
+"""
+
+import argparse
+import datetime
+import difflib
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ccil_jax.config import ConfigError
+from ccil_jax.demonstrations import DemonstrationsError
+
+
+class UsageError(ValueError):
+    """Wrong input. The message is one line that names the option or file and the remedy."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose every complaint is one line; `--num_seeds` and `--num-seeds` are the same option."""
+
+    def __init__(self, name: str, description: str) -> None:
+        super().__init__(
+            prog=f"python -m experiments.{name}",
+            usage=f"python -m experiments.{name} [options]",
+            description=description,
+            allow_abbrev=False,  # an abbreviation would change its meaning when options are added
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As in argparse, but suggests the nearest option for an unknown one."""
+        given = [_hyphenated(a) for a in (sys.argv[1:] if args is None else args)]
+        parsed, unknown = self.parse_known_args(given, namespace)
+        if unknown:
+            option = unknown[0].split("=")[0]
+            known = [o for o in self._option_string_actions if o.startswith("--")]
+            near = difflib.get_close_matches(option, known, n=1)
+            self.error(f"{option}: unknown; " + (f"did you mean {near[0]}?" if near else "see --help"))
+        return parsed
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program with exit status 2 and one line on stderr."""
+        line = " ".join(message.split()).removeprefix("argument ")
+        self.exit(2, f"{self.prog}: error: {line}\n")
+
+
+def _hyphenated(token: str) -> str:
+    name, equals, value = token.partition("=")
+    return name.replace("_", "-") + equals + value if token.startswith("--") else token
+
+
+def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None], argv: Sequence[str] | None) -> int:
+    """Parses and runs; wrong input found later than parsing ends in the same one line and exit status 2."""
+    arguments = parser.parse_args(argv)
+    try:
+        return run(arguments) or 0
+    except (UsageError, ConfigError, DemonstrationsError) as error:
+        parser.error(str(error))
+
+
+def command() -> str:
+    """The command line of this process, as a person would type it."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    program = f"python -m {spec.name}" if spec else Path(sys.argv[0]).name
+    return " ".join([program, *sys.argv[1:]])
+
+
+def integer(text: str) -> int:
+    """An integer; 3000000, 3_000_000 and 3e6 are the same."""
+    value = float(text)
+    if not value.is_integer():
+        raise ValueError(text)
+    return int(value)
+
+
+def positive(text: str) -> int:
+    """An integer of at least 1."""
+    if integer(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
+    return integer(text)
+
+
+def natural(text: str) -> int:
+    """An integer that fits a 32-bit seed."""
+    if not 0 <= integer(text) < 2**32:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 0 and below 2**32")
+    return integer(text)
+
+
+def boolean(text: str) -> bool:
+    """true or false, in the usual spellings."""
+    if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
+        raise argparse.ArgumentTypeError(f"{text!r}: give true or false")
+    return text.lower() in ("true", "yes", "1")
+
+
+def default_folder(task: str, method: str) -> Path:
+    """`runs/<task>_<method>_<timestamp>`."""
+    stamp = datetime.datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    return Path("runs") / f"{task}_{method}_{stamp}"
+
+
+def check_output_folder(folder: Path, *, resume: bool = False, option: str = "--out") -> None:
+    """Makes `folder` and proves that it can be written. Raises `UsageError`, also where runs would be mixed."""
+    try:
+        holds_run = (folder / "config.json").is_file()
+        occupied = folder.is_dir() and any(folder.iterdir())
+    except OSError as error:
+        raise UsageError(f"{option} {folder}: cannot be read ({error.strerror}); choose another folder") from None
+    if resume and not holds_run:
+        raise UsageError(f"--resume: {folder} holds no run (no config.json); leave --resume out or correct {option}")
+    if holds_run and not resume:
+        raise UsageError(f"{option} {folder}: already holds a run; continue it with --resume or choose another folder")
+    if occupied and not resume:
+        raise UsageError(f"{option} {folder}: not empty; choose a new folder")
+    check_writable(folder, option)
+
+
+def check_writable(folder: Path, option: str) -> None:
+    """Makes `folder` and writes a byte in it. Raises `UsageError` that names `option`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise UsageError(f"{option} {folder}: cannot be written ({reason}); choose another folder") from None

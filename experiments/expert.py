@@ -1,0 +1,166 @@
+"""Trains a constrained expert on the task's own reward and records demonstrations.
+
+Which seed is recorded: among the seeds whose mean evaluation cost is at most the limit, the one with the highest mean
+return. If none keeps the limit nothing is written and the exit status is 1. With --unconstrained there is no limit and
+the highest return wins. Episodes are recorded with the stochastic policy, as it was trained.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ccil_jax.demonstrations import Demonstrations, save_demonstrations
+from experiments import command_line, options, run_folder
+from experiments.command_line import Parser, UsageError
+from experiments.resuming import resumed
+from experiments.summary import number, show
+from experiments.training import Outcome, Plan, execute
+
+
+def make_parser() -> Parser:
+    """The options of this launcher, `Config` fields included."""
+    parser = Parser("expert", __doc__ or "")
+    options.add_run_options(parser)
+    parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
+    parser.add_argument("--unconstrained", action="store_true", help="plain TRPO, blind to the cost (no --cost-limit)")
+    parser.add_argument(
+        "--num-trajectories", default=10, type=command_line.positive, metavar="N", help="to record (default: 10)"
+    )
+    parser.add_argument(
+        "--run-dir", type=Path, metavar="DIR", help="run folder of the training (default: runs/<task>_<method>_<time>)"
+    )
+    parser.add_argument("--resume", action="store_true", help="continue the run in --run-dir from its last checkpoint")
+    options.add_config_options(parser, hide=("method",))
+    return parser
+
+
+def make_plan(arguments: argparse.Namespace) -> Plan:
+    """Turns the options into a `Plan`. Raises `UsageError` or `ConfigError` for wrong input."""
+    own = ("out", "overwrite", "unconstrained", "num_trajectories", "run_dir", "resume")
+    given = {k: v for k, v in vars(arguments).items() if k not in own}
+    given["method"] = method = "trpo" if arguments.unconstrained else "expert"
+    if arguments.unconstrained and given.get("cost_limit") is not None:
+        raise UsageError("--cost-limit: --unconstrained has no limit; give one or the other")
+    if arguments.out.suffix != ".npz":
+        raise UsageError(f"--out {arguments.out}: a demonstrations file is named *.npz")
+    if arguments.out.exists() and not arguments.overwrite:
+        raise UsageError(f"--out {arguments.out}: exists; choose another name or add --overwrite")
+    if arguments.resume:
+        given = resumed(arguments.run_dir, given, "--run-dir")
+    choices = {**options.DEFAULTS, "env": None, **given}
+    task = options.find_task(choices["env"])
+    if not arguments.unconstrained:
+        choices.setdefault("cost_limit", task.cost_limit)
+    config = options.config_from(choices, choices["preset"])
+    folder = arguments.run_dir or command_line.default_folder(task.name, method)
+    command_line.check_writable(arguments.out.parent, "--out")
+    command_line.check_output_folder(folder, resume=arguments.resume, option="--run-dir")
+    return Plan(
+        config=config,
+        preset=choices["preset"],
+        task=task.name,
+        physics=choices["physics"],
+        env_options=options.env_options(choices, task),
+        demonstrations=None,
+        demonstrations_path=None,
+        num_seeds=choices["num_seeds"],
+        seed=choices["seed"],
+        folder=folder,
+        resume=arguments.resume,
+        eval_episodes=choices["eval_episodes"],
+        command=command_line.command(),
+    )
+
+
+def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int | None:
+    """The seed with the highest return among those within the limit; None if there is none."""
+    allowed = [row for row in rows if cost_limit is None or row["episode_cost"] <= cost_limit]
+    return max(allowed, key=lambda row: row["episode_return"])["seed"] if allowed else None
+
+
+def record(plan: Plan, outcome: Outcome, seed: int, num_trajectories: int) -> Demonstrations:
+    """Rolls out the chosen seed's policy and adds what a reader of the file needs to know."""
+    import jax
+
+    from ccil_jax import evaluation
+
+    actor = jax.tree.map(lambda leaf: leaf[seed], outcome.result.agent)
+    row = outcome.summary["per_seed"][seed]
+    facts = {
+        "task": plan.task,
+        "method": plan.config.method,
+        "cost_limit": plan.config.cost_limit,
+        **plan.env_options,
+        "physics": outcome.env.physics_name,
+        "env_steps": outcome.result.env_steps,
+        "seed": plan.seed,
+        "seed_index": seed,
+        "evaluation": {k: row[k] for k in ("episode_return", "episode_cost", "episode_length")},
+        "random_policy": {k: outcome.summary[f"random_{k}"] for k in ("return", "cost")},
+        "command": plan.command,
+        "versions": run_folder.versions(),
+        "git_commit": run_folder.git_commit(),
+    }
+    return evaluation.record(
+        outcome.result.config,
+        actor,
+        outcome.env,
+        num_episodes=num_trajectories,
+        seed=plan.evaluation_seed + 1,
+        metadata=facts,
+    )
+
+
+def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
+    """One table: each recorded trajectory's length, return and cost, and their means beside the limit."""
+    from rich.table import Table
+
+    returns = demonstrations.episode_returns
+    table = Table(title=f"recorded in {path}", title_justify="left")
+    for heading in ("", "return", "cost", "steps"):
+        table.add_column(heading, justify="right" if heading else "left")
+    costs, lengths = demonstrations.episode_costs, demonstrations.episode_lengths
+    for i, (cost, length) in enumerate(zip(costs, lengths, strict=True)):
+        table.add_row(f"trajectory {i}", number(None if returns is None else returns[i]), number(cost), str(length))
+    table.add_section()
+    mean_return = None if returns is None else float(np.mean(returns))
+    length = number(demonstrations.mean_episode_length)
+    table.add_row("mean", number(mean_return), number(demonstrations.mean_episode_cost), length)
+    random = demonstrations.metadata["random_policy"]
+    table.add_row("random policy", number(random["return"]), number(random["cost"]), "")
+    if demonstrations.metadata["cost_limit"] is not None:
+        table.add_row("limit", "", number(demonstrations.metadata["cost_limit"]), "")
+    show(table)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Trains, chooses, records; status 1 where no seed keeps the limit."""
+    plan = make_plan(arguments)
+    outcome = execute(plan)
+    seed = choose_seed(outcome.summary["per_seed"], plan.config.cost_limit)
+    if seed is None:
+        lowest = min(row["episode_cost"] for row in outcome.summary["per_seed"])
+        print(
+            f"no seed keeps --cost-limit {plan.config.cost_limit:g} (lowest cost {lowest:g}): nothing was recorded; "
+            "train longer (--env-steps), use more seeds or a higher limit",
+            file=sys.stderr,
+        )
+        return 1
+    demonstrations = record(plan, outcome, seed, arguments.num_trajectories)
+    save_demonstrations(arguments.out, demonstrations)
+    print_demonstrations(demonstrations, arguments.out)
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

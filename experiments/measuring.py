@@ -1,0 +1,220 @@
+"""One row of the benchmark: how fast physics, rollouts, training and the meta-gradient are on this machine."""
+
+import dataclasses
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco.batch import Batch as RawBatch
+
+import envs
+from ccil_jax import networks, policy_step, rollout, runner, running_statistics
+from ccil_jax.config import PRESETS, Config
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.methods import METHODS
+from ccil_jax.types import Batch
+
+Work = Callable[[], int]  # does a fixed amount of work, waits for it, and returns how many units it was
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Setting:
+    """What a row measures."""
+
+    task: str
+    physics: str
+    method: str
+    num_seeds: int
+    num_envs: int
+    preset: str
+    rounds: int  # measurements of each kind, taken in turn
+    seconds: float  # least duration of one measurement
+    seed: int
+
+
+def measure(setting: Setting) -> dict[str, Any]:
+    """Measures everything in turn, `rounds` times, and returns medians. Rates are control steps of all seeds per second.
+
+    A control step is `frame_skip` engine steps. `physics_steps_per_second` is the C engine alone, stepping as many
+    simulations as training does under random controls: the ceiling of the native backend.
+    """
+    env: Any = envs.make(setting.task, physics=setting.physics)
+    config = Config(**{**PRESETS[setting.preset], "method": setting.method, "num_envs": setting.num_envs})
+    config = config.replace(env_steps=2 * config.steps_per_iteration)  # a chunk is two iterations
+    training, compile_seconds = _training(config, env, setting)
+    plain, meta = _policy_steps(config, env, setting)
+    works = {
+        "physics": _physics(env, setting),
+        "rollout": _rollout(config, env, setting),
+        "training": training,
+        "plain": plain,
+        "meta": meta,
+    }
+    rates: dict[str, list[float]] = {name: [] for name in works}
+    for work in works.values():
+        work()  # compiles, and warms caches
+    for _ in range(setting.rounds):
+        for name, work in works.items():
+            rates[name].append(_rate(work, setting.seconds))
+    median = {name: float(np.median(values)) for name, values in rates.items()}
+    return {
+        "task": setting.task,
+        "physics": env.physics_name,
+        "method": setting.method,
+        "num_seeds": setting.num_seeds,
+        "num_envs": setting.num_envs,
+        "frame_skip": env.task.frame_skip,
+        "physics_steps_per_second": median["physics"],
+        "rollout_steps_per_second": median["rollout"],
+        "training_steps_per_second": median["training"],
+        "rollout_to_physics": median["rollout"] / median["physics"],
+        "training_to_physics": median["training"] / median["physics"],
+        "meta_gradient_to_policy_step": median["plain"] / median["meta"],
+        "policy_step_seconds": 1 / median["plain"],
+        "meta_gradient_seconds": 1 / median["meta"],
+        "compile_seconds": compile_seconds,
+        "peak_memory_mib": _peak_memory(),
+        "all_rates": rates,
+    }
+
+
+def _rate(work: Work, seconds: float) -> float:
+    """Units per second of `work`, repeated for at least `seconds`."""
+    units, start = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - start) < seconds or units == 0:
+        units += work()
+    return units / elapsed
+
+
+def _peak_memory() -> float:
+    """Largest resident size of this process so far, MiB."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
+
+
+def _physics(env: Any, setting: Setting) -> Work:
+    """The engine alone: no JAX, no observations, rewards or resets."""
+    from envs.physics.native import usable_cpus
+
+    num_sims, num_steps = setting.num_seeds * setting.num_envs, 100
+    engine = RawBatch(env.model, num_sims, min(usable_cpus(), num_sims))
+    before = mujoco.mjtState.mjSTATE_PHYSICS | mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_WARMSTART
+    start = mujoco.mj_stateSize(env.model, int(before))
+    columns = slice(start, start + env.model.nu)
+    random = np.random.default_rng(setting.seed)
+    controls = random.uniform(env.action_low, env.action_high, (num_steps, num_sims, env.model.nu))
+
+    def work() -> int:
+        for control in controls:
+            engine.state[:, columns] = control
+            engine.step(nstep=env.task.frame_skip)
+        return num_steps * num_sims
+
+    return work
+
+
+def _rollout(config: Config, env: Any, setting: Setting) -> Work:
+    """Policy and environment inside one compiled program, without learning."""
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim)
+
+    def init(key: jax.Array) -> tuple[Any, Any]:
+        policy_key, env_key = jax.random.split(key)
+        statistics = running_statistics.init(env.obs_dim)
+        actor = rollout.Actor(policy_params=policy.init(policy_key), obs_statistics=statistics)
+        return actor, rollout.init(env, config.num_envs, env_key)
+
+    @jax.jit
+    @jax.vmap
+    def run(actor: Any, state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        state, transition = rollout.rollout(env, policy.apply, actor, state, config.num_steps, key)
+        return state, jnp.mean(transition.reward)
+
+    keys = jax.random.split(jax.random.key(setting.seed), setting.num_seeds)
+    actor, state = jax.jit(jax.vmap(init))(keys)
+
+    def work() -> int:
+        nonlocal state
+        state, _ = _wait(run(actor, state, keys))
+        return setting.num_seeds * config.batch_size
+
+    return work
+
+
+def _training(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
+    """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
+    random = np.random.default_rng(setting.seed)
+    num_steps = 10_000
+    expert = Demonstrations(
+        obs=random.standard_normal((num_steps, env.obs_dim)).astype(np.float32),
+        actions=random.uniform(env.action_low, env.action_high, (num_steps, env.action_dim)).astype(np.float32),
+        rewards=None,
+        costs=np.ones(num_steps, np.float32),
+        terminated=np.zeros(num_steps, bool),
+        truncated=np.arange(num_steps) % 1000 == 999,
+        episode_ends=np.arange(1000, num_steps + 1, 1000),
+    )
+    resolved = runner.resolve(config, env, expert)
+    program = runner.compile_program(resolved, env, runner.expert_data(expert), setting.num_seeds)
+    state = program.init(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
+
+    def work() -> int:
+        nonlocal state
+        state, _ = _wait(program.chunk(state))
+        return setting.num_seeds * program.chunk_length * config.steps_per_iteration
+
+    return work, program.compile_seconds
+
+
+def _policy_steps(config: Config, env: Any, setting: Setting) -> tuple[Work, Work]:
+    """One plain policy step and one outer step (dual step and meta-gradient) of malm, all seeds side by side."""
+    config = config.replace(method="malm", cost_limit=0.0)
+    constraint = METHODS["malm"].constraint(config)
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim)
+
+    def samples(key: jax.Array) -> tuple[Any, Batch, Batch]:
+        params_key, obs_key, action_key, advantage_key = jax.random.split(key, 4)
+        advantages = jax.random.normal(advantage_key, (2, config.batch_size))
+        batch = Batch(
+            obs=jax.random.normal(obs_key, (config.batch_size, env.obs_dim)),
+            action=jax.random.normal(action_key, (config.batch_size, env.action_dim)),
+            reward_advantage=advantages[0],
+            cost_advantage=advantages[1],
+            returns=advantages.T,
+            cost=(advantages[1] > 0).astype(advantages.dtype),
+        )
+        return policy.init(params_key), *policy_step.split(batch, config.num_held_out, action_key)
+
+    @jax.jit
+    @jax.vmap
+    def plain(params: Any, held_out: Batch, training: Batch) -> Any:
+        multiplier, gap = jnp.asarray(0.5), jnp.asarray(1.0)
+        return policy_step.improve(config, policy.apply, constraint, params, training, multiplier, gap, held_out)
+
+    @jax.jit
+    @jax.vmap
+    def meta(taken: Any) -> Any:
+        outer = policy_step.outer_problem(config, policy.apply, constraint, taken)
+        return constraint.update(constraint.init(), jnp.asarray(1.0), outer)
+
+    inputs = jax.jit(jax.vmap(samples))(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
+    taken = plain(*inputs)[1]
+    return _once(lambda: plain(*inputs)), _once(lambda: meta(taken))
+
+
+def _wait(values: Any) -> Any:
+    """Returns `values` once they are computed."""
+    return jax.tree.map(lambda leaf: leaf.block_until_ready(), values)
+
+
+def _once(call: Callable[[], Any]) -> Work:
+    def work() -> int:
+        _wait(call())
+        return 1
+
+    return work

@@ -1,0 +1,125 @@
+"""Options that training launchers share: the `Config` fields, and what a run is besides its hyperparameters."""
+
+import argparse
+import dataclasses
+import difflib
+import types
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ccil_jax.config import CHOICES, PRESETS, Config, ConfigError, validate
+from envs.registry import PHYSICS, TASKS, TaskInfo
+from experiments.command_line import Parser, UsageError, boolean, integer, natural, positive
+
+CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
+DEFAULTS: Mapping[str, Any] = {
+    "num_seeds": 3,
+    "seed": 0,
+    "physics": "auto",
+    "cost_threshold": None,
+    "contact_cost": True,
+    "max_episode_steps": 1000,
+    "preset": "default",
+    "eval_episodes": 50,
+}
+
+
+def add_run_options(parser: Parser) -> None:
+    """Everything in `DEFAULTS` and --env. What is not given is absent from the parsed arguments."""
+
+    def add(name: str, help: str, **settings: Any) -> None:
+        default = DEFAULTS.get(name)
+        suffix = "" if default is None else f" (default: {str(default).lower()})"
+        parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, help=help + suffix, **settings)
+
+    add("env", f"task: {', '.join(TASKS)}", metavar="TASK")
+    add("num_seeds", "seeds trained side by side in one program", type=positive, metavar="S")
+    add("seed", "base seed: the same seed, number of seeds and versions give the same bits", type=natural, metavar="N")
+    add("preset", "hyperparameters to start from", choices=tuple(PRESETS))
+    add("physics", "engine; auto is native on a CPU and mjx on an accelerator", choices=PHYSICS)
+    add("cost_threshold", "per-step threshold of the 0/1 cost (default: the task's)", type=float, metavar="X")
+    add("contact_cost", "whether the contact term counts in the cost (Ant, Humanoid)", type=boolean, metavar="BOOL")
+    add("max_episode_steps", "time limit of an episode", type=positive, metavar="T")
+    add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
+
+
+def add_config_options(parser: Parser, *, hide: Sequence[str] = ()) -> None:
+    """One option per `Config` field, except `hide`. What is not given is absent from the parsed arguments."""
+    static = parser.add_argument_group("hyperparameters that shape the program (a change compiles anew)")
+    traced = parser.add_argument_group("hyperparameters inside the program")
+    for field in dataclasses.fields(Config):
+        if field.name in hide:
+            continue
+        choices = f"; one of {', '.join(CHOICES[field.name])}" if field.name in CHOICES else ""
+        default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
+        (traced if field.metadata["traced"] else static).add_argument(
+            "--" + field.name.replace("_", "-"),
+            dest=field.name,
+            type=_parser_of(field.type),
+            default=argparse.SUPPRESS,
+            metavar="X",
+            help=f"{field.metadata['help']}{choices} (default: {default.lower()})".replace("%", "%%"),
+        )
+
+
+def config_from(given: Mapping[str, Any], preset: str) -> Config:
+    """The preset with the given options on top, validated. Raises `ConfigError`."""
+    config = Config(**{**PRESETS[preset], **{k: v for k, v in given.items() if k in CONFIG_FIELDS}})
+    try:
+        validate(config)
+    except ConfigError as error:
+        raise ConfigError(_with_hyphens(str(error))) from None
+    return config
+
+
+def find_task(name: str | None, option: str = "--env") -> TaskInfo:
+    """The description of a task. Raises `UsageError` with the nearest name for an unknown one."""
+    if name is None:
+        raise UsageError(f"{option}: required; one of {', '.join(TASKS)}")
+    if name in TASKS:
+        return TASKS[name]
+    near = difflib.get_close_matches(name, TASKS, n=1, cutoff=0.4)
+    hint = f"did you mean {near[0]}? " if near else ""
+    raise UsageError(f"{option} {name}: unknown task; {hint}choose one of {', '.join(TASKS)}")
+
+
+def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
+    """What `envs.make` gets besides task and physics, nothing left to a default. Raises `UsageError`."""
+    threshold = choices["cost_threshold"]
+    if threshold is not None and not 0 <= threshold < float("inf"):
+        raise UsageError(f"--cost-threshold {threshold}: must be finite and not negative")
+    return {
+        "cost_threshold": task.cost_threshold if threshold is None else threshold,
+        "contact_cost": choices["contact_cost"],
+        "max_episode_steps": choices["max_episode_steps"],
+    }
+
+
+def _with_hyphens(message: str) -> str:
+    for name in CONFIG_FIELDS:
+        message = message.replace(f"--{name}", "--" + name.replace("_", "-"))
+    return message
+
+
+def _parser_of(annotation: Any) -> Callable[[str], Any]:
+    if typing.get_origin(annotation) is tuple:
+        return _sizes
+    if isinstance(annotation, types.UnionType):
+        return _number
+    parsers: dict[type, Callable[[str], Any]] = {int: integer, bool: boolean, float: float, str: str}
+    return parsers[annotation]
+
+
+def _sizes(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(integer(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give sizes such as 100,100") from None
+
+
+def _number(text: str) -> float | None:
+    try:
+        return None if text.lower() == "none" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a number or none") from None

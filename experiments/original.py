@@ -1,0 +1,130 @@
+"""Episodes of a learnt policy in gymnasium's own `-v5` simulator: one process, NumPy only, none of our physics.
+
+Reward and cost follow the task's rule (`envs.locomotion`), fed with the reward terms that gymnasium reports.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ccil_jax.config import Config
+from envs.registry import TASKS
+
+_CLIP = 5.0  # of normalised observations, as in ccil_jax.running_statistics
+_MIN_STD = 1e-2
+_ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0),
+    "swish": lambda x: x / (1 + np.exp(-x)),
+}
+_TERMS = {
+    "forward": "reward_forward",
+    "healthy": "reward_survive",
+    "control": "reward_ctrl",
+    "contact": "reward_contact",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Totals:
+    """Undiscounted totals of whole episodes, [num_seeds, num_episodes] each."""
+
+    episode_return: np.ndarray
+    episode_cost: np.ndarray
+    episode_length: np.ndarray
+
+
+class NumpyPolicy:
+    """The forward pass of one seed's policy; `actor` is that seed's `ccil_jax.rollout.Actor` (no seed axis)."""
+
+    def __init__(self, config: Config, actor: Any) -> None:
+        layers = actor.policy_params["mean"]["params"]
+        self._layers = [
+            (np.asarray(layers[name]["kernel"], np.float64), np.asarray(layers[name]["bias"], np.float64))
+            for name in sorted(layers, key=lambda name: int(name.rsplit("_", 1)[1]))
+        ]
+        self._activation = _ACTIVATIONS[config.activation]
+        statistics = actor.obs_statistics
+        count = float(statistics.count)
+        variance = np.asarray(statistics.sum_squares, np.float64) / max(count, 1.0)
+        self._mean = np.asarray(statistics.mean, np.float64)
+        self._std = np.maximum(np.sqrt(variance), _MIN_STD) if count > 0 else np.ones_like(variance)
+        self._action_std = np.exp(np.asarray(actor.policy_params["log_std"], np.float64))
+
+    def mode(self, obs: np.ndarray) -> np.ndarray:
+        """[obs_dim] -> [action_dim], the mean of the policy's distribution."""
+        x = np.clip((obs - self._mean) / self._std, -_CLIP, _CLIP)
+        for kernel, bias in self._layers[:-1]:
+            x = self._activation(x @ kernel + bias)
+        kernel, bias = self._layers[-1]
+        return x @ kernel + bias
+
+    def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """[obs_dim] -> [action_dim], drawn from the policy."""
+        return self.mode(obs) + self._action_std * random.standard_normal(self._action_std.shape)
+
+
+def evaluate(
+    config: Config,
+    actor: Any,
+    env: Any,
+    *,
+    num_episodes: int,
+    seed: int = 0,
+    deterministic: bool = False,
+    contact_cost: bool = True,
+) -> Totals:
+    """As `ccil_jax.evaluation.evaluate`, in gymnasium's simulator. `actor` is [num_seeds]-leading.
+
+    `contact_cost` is the option of that name which `env` was made with.
+    """
+    import gymnasium
+    import jax
+
+    simulator = gymnasium.make(
+        TASKS[env.name].gymnasium_id,
+        max_episode_steps=env.max_episode_steps,
+        **({"include_cfrc_ext_in_observation": False} if env.name in ("Ant", "Humanoid") else {}),
+    )
+    num_seeds = len(actor.obs_statistics.count)
+    results = []
+    for index in range(num_seeds):
+        policy = NumpyPolicy(config, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), actor))
+        random = np.random.default_rng([seed, index])
+        for episode in range(num_episodes):
+            steps = _run_episode(simulator, policy, random, (seed + episode) % 2**32, deterministic)
+            results.append(_score(env, steps, contact_cost))
+    simulator.close()
+    totals = np.array(results).reshape(num_seeds, num_episodes, 3)
+    return Totals(totals[..., 0], totals[..., 1], totals[..., 2])
+
+
+def _run_episode(
+    simulator: Any, policy: NumpyPolicy, random: np.random.Generator, seed: int, deterministic: bool
+) -> dict[str, np.ndarray]:
+    """What gymnasium reports at each of T steps: `velocity [T, 2]` and the four reward terms `[T]`."""
+    obs, _ = simulator.reset(seed=seed)
+    low, high = simulator.action_space.low, simulator.action_space.high
+    rows = []
+    done = False
+    while not done:
+        action = policy.mode(obs) if deterministic else policy.sample(obs, random)
+        obs, _, terminated, truncated, info = simulator.step(np.clip(action, low, high))
+        done = terminated or truncated
+        velocity = [info["x_velocity"], info.get("y_velocity", 0.0)]
+        rows.append(velocity + [info.get(key, 0.0) for key in _TERMS.values()])
+    table = np.array(rows)
+    return {"velocity": table[:, :2], **{name: table[:, 2 + i] for i, name in enumerate(_TERMS)}}
+
+
+def _score(env: Any, steps: dict[str, np.ndarray], contact_cost: bool) -> tuple[float, float, int]:
+    """Return, cost and length of an episode under the task's rule."""
+    import jax
+
+    reward = sum(steps[name] for name in env.task.reward_terms)
+    contact = -steps["contact"] if contact_cost else np.zeros_like(steps["contact"])
+    quantity = jax.vmap(env.task.cost_quantity)(steps["velocity"], -steps["control"], contact)
+    cost = np.asarray(quantity) > env.cost_threshold
+    return float(np.sum(reward)), float(np.sum(cost)), len(cost)

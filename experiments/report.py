@@ -1,0 +1,253 @@
+"""One self-contained HTML page about finished runs: curves, metrics with intervals, every seed, what was different."""
+
+import argparse
+import base64
+import dataclasses
+import html
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import command_line, run_folder
+from experiments.command_line import Parser, UsageError
+from experiments.run_folder import Run
+from experiments.statistics import bootstrap_interval
+from experiments.summary import number
+
+_COLUMNS = (
+    ("episode_return", "return"),
+    ("episode_cost", "cost"),
+    ("recovered_return", "recovered return, %"),
+    ("relative_cost_violation", "relative cost violation"),
+    ("penalized_return", "penalised return, %"),
+    ("cost_rate", "cost rate in training"),
+)
+_NOTE = (
+    "Return and cost are undiscounted sums over whole evaluation episodes of the final policy. Between seeds: "
+    "interquartile mean with its 95% bootstrap interval. Recovered return is 0% for a random policy and 100% for the "
+    "expert; violation counts what exceeds the expert's cost, relative to that cost; penalised return is the recovered "
+    "return less the violation in per cent."
+)
+_STYLE = """
+:root { color-scheme: light; --ink: #22262b; --soft: #5b626c; --line: #e3e6ea; --accent: #0b6e99; }
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
+h1 { font-size: 1.7rem; margin-bottom: .2rem; }
+h2 { font-size: 1.3rem; margin-top: 2.6rem; border-bottom: 2px solid var(--accent); padding-bottom: .2rem; }
+h3 { font-size: 1rem; margin: 1.6rem 0 .4rem; }
+p.note, figcaption { color: var(--soft); font-size: .9rem; max-width: 48rem; }
+figure { margin: 1rem 0; } img, canvas { max-width: 100%; }
+div.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
+th, td { padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 600; }
+td small { color: var(--soft); } details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); }
+code { font-size: .86rem; background: #f4f6f8; padding: .05rem .3rem; white-space: pre-wrap; }
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One finished run."""
+
+    run: Run
+    summary: dict[str, Any]
+    label: str
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return str(self.run.facts["task"])
+
+
+def make_parser() -> Parser:
+    """The options of this launcher."""
+    parser = Parser("report", __doc__ or "")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN_DIR", help="folders that `train` or `expert` wrote")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE.html", help="page to write (default: report.html in the only run, or here)"
+    )
+    parser.add_argument(
+        "--seed", default=0, type=command_line.natural, metavar="N", help="of the bootstrap (default: 0)"
+    )
+    parser.add_argument(
+        "--no-animation", action="store_true", help="leave out the episodes that are played on the page"
+    )
+    return parser
+
+
+def read_entries(folders: Sequence[Path]) -> list[Entry]:
+    """Reads the runs. Raises `UsageError` for a folder that is not a finished run."""
+    entries = []
+    for folder in folders:
+        if not folder.is_dir():
+            raise UsageError(f"RUN_DIR {folder}: no such folder; give a folder that `train` wrote")
+        run = run_folder.read_run(folder)
+        if not (folder / "summary.json").is_file():
+            raise UsageError(f"RUN_DIR {folder}: not finished (no summary.json); finish it with `train --resume`")
+        entries.append(Entry(run, run_folder.read_json(folder / "summary.json"), run.config.method))
+    pairs = [(e.task, e.label) for e in entries]
+    return [
+        dataclasses.replace(e, label=f"{e.label} ({e.run.folder.name})") if pairs.count((e.task, e.label)) > 1 else e
+        for e in entries
+    ]
+
+
+def page(entries: Sequence[Entry], *, seed: int = 0, player: Callable[[Entry], str] | None = None) -> str:
+    """The whole page; `player` gives the HTML of an episode of a run, or an empty string."""
+    tasks = list(dict.fromkeys(e.task for e in entries))
+    parts = [
+        "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
+        "<meta name=viewport content='width=device-width, initial-scale=1'>",
+        f"<title>{_text(', '.join(tasks))}: imitation under cost constraints</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{_text(', '.join(tasks))}: imitation under cost constraints</h1>",
+        f"<p class=note>{_NOTE}</p>",
+    ]
+    if len(tasks) > 1:
+        parts.append(_across_tasks(entries, seed))
+    for task in tasks:
+        parts += _task_section(task, [e for e in entries if e.task == task], seed, player)
+    return "\n".join([*parts, "</body></html>\n"])
+
+
+def _task_section(
+    task: str, entries: Sequence[Entry], seed: int, player: Callable[[Entry], str] | None
+) -> Iterable[str]:
+    from experiments import figures  # imports matplotlib
+
+    curves = [figures.read_curve(e.run.folder, e.label) for e in entries]
+    image = base64.b64encode(figures.png(figures.draw_panels(curves, task))).decode()
+    yield f"<h2>{_text(task)}</h2>"
+    yield (
+        f"<figure><img alt='Return, cost and cost rate on {_text(task)}' src='data:image/png;base64,{image}'>"
+        "<figcaption>Thick: mean over seeds. Band: standard deviation. Thin: every seed. "
+        "Dashed: mean of the demonstrations.</figcaption></figure>"
+    )
+    yield _metrics_table(entries, seed)
+    yield from (text for e in entries if player and (text := player(e)))
+    yield "<details><summary>Every seed</summary>" + _seeds_table(entries) + "</details>"
+    yield "<details><summary>How the runs differ, and where they were made</summary>" + _differences(entries)
+    yield "</details>"
+
+
+def _metrics_table(entries: Sequence[Entry], seed: int) -> str:
+    rows = []
+    for e in entries:
+        cells = [_text(e.label), str(e.summary["num_seeds"])]
+        for name, _ in _COLUMNS:
+            values = [row[name] for row in e.summary["per_seed"]]
+            cells.append("-" if None in values else _interval([np.array(values)], seed))
+        cells += [f"{e.summary['env_steps']:,}", _rate(e.summary["env_steps_per_second"])]
+        rows.append(cells)
+    first = entries[0].summary
+    blanks = [""] * (len(_COLUMNS) - 2 + 2)
+    if first["expert_cost"] is not None:
+        rows.append(["expert", "", number(first["expert_return"]), number(first["expert_cost"]), *blanks])
+    rows.append(["random policy", "", number(first["random_return"]), number(first["random_cost"]), *blanks])
+    return _table(["", "seeds", *(title for _, title in _COLUMNS), "steps per seed", "steps/s"], rows)
+
+
+def _across_tasks(entries: Sequence[Entry], seed: int) -> str:
+    """Methods that were run on several tasks: seeds are resampled within each task."""
+    rows = []
+    for method in dict.fromkeys(e.run.config.method for e in entries):
+        chosen = [e for e in entries if e.run.config.method == method]
+        cells = [method, str(len({e.task for e in chosen}))]
+        for name in ("recovered_return", "relative_cost_violation", "penalized_return"):
+            strata = [np.array([row[name] for row in e.summary["per_seed"]], np.float64) for e in chosen]
+            cells.append(_interval(strata, seed) if all(np.isfinite(s).all() for s in strata) else "-")
+        rows.append(cells)
+    titles = ["", "tasks", "recovered return, %", "relative cost violation", "penalised return, %"]
+    return "<h2>Across tasks</h2>" + _table(titles, rows)
+
+
+def _seeds_table(entries: Sequence[Entry]) -> str:
+    rows = [
+        [_text(f"{e.label}, seed {row['seed']}"), *(number(row[name]) for name, _ in _COLUMNS)]
+        for e in entries
+        for row in e.summary["per_seed"]
+    ]
+    return _table(["", *(title for _, title in _COLUMNS)], rows)
+
+
+def _differences(entries: Sequence[Entry]) -> str:
+    fields = [dataclasses.asdict(e.run.config) for e in entries]
+    differing = [name for name in fields[0] if len({repr(f[name]) for f in fields}) > 1]
+    rows = [[_text(name), *(_text(str(f[name])) for f in fields)] for name in differing]
+    text = _table(["field", *(_text(e.label) for e in entries)], rows) if rows else "<p>All fields are equal.</p>"
+    for e in entries:
+        facts, demos = e.run.facts, e.run.facts["demonstrations"]
+        versions = ", ".join(f"{k} {v}" for k, v in facts["versions"].items())
+        text += (
+            f"<h3>{_text(e.label)}</h3><p><code>{_text(facts['command'])}</code></p><p class=note>"
+            f"physics {_text(facts['physics'])}, device {_text(facts['device']['kind'])}, "
+            f"commit {_text(str(facts['git_commit']))}, {_text(versions)}"
+            + (
+                f", demonstrations sha256 {_text(demos['sha256'])}, {demos['num_episodes']} trajectories"
+                if demos
+                else ""
+            )
+            + "</p>"
+        )
+    return text
+
+
+def _interval(strata: Sequence[np.ndarray], seed: int) -> str:
+    interval = bootstrap_interval(strata, seed=seed)
+    return f"{number(interval.value)} <small>[{number(interval.low)}, {number(interval.high)}]</small>"
+
+
+def _rate(steps_per_second: float | None) -> str:
+    return "-" if steps_per_second is None else f"{steps_per_second:,.0f}"
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{title}</th>" for title in titles)
+    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _text(value: str) -> str:
+    return html.escape(value, quote=True)
+
+
+def animate(entry: Entry) -> str:
+    """The HTML of an episode of a run's best seed, or an empty string where the run cannot be loaded."""
+    checkpoints = entry.run.folder.resolve() / "checkpoints"
+    if not checkpoints.is_dir():
+        return ""
+    import jax
+
+    import envs  # imports JAX: only where an episode is asked for
+    from ccil_jax import runner
+    from experiments import animation, original
+
+    facts, config = entry.run.facts, entry.run.config
+    env = envs.make(facts["task"], physics=facts["physics"], **facts["env_options"])
+    loaded = runner.load(config, env, checkpoints, facts["num_seeds"])
+    best = max(entry.summary["per_seed"], key=lambda row: row["episode_return"])["seed"]
+    policy = original.NumpyPolicy(config, jax.tree.map(lambda leaf: np.asarray(leaf[best]), loaded.agent))
+    name = f"episode-{entry.task}-{entry.run.folder.resolve().name}"
+    return animation.to_html(animation.record_poses(env, policy), name, f"{entry.label}, seed {best}.")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Reads the runs and writes the page."""
+    entries = read_entries(arguments.runs)
+    path = arguments.out or (arguments.runs[0] if len(entries) == 1 else Path()) / "report.html"
+    command_line.check_writable(path.parent, "--out")
+    path.write_text(
+        page(entries, seed=arguments.seed, player=None if arguments.no_animation else animate), encoding="utf-8"
+    )
+    print(f"written to {path}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""What `--resume` needs to know: the choices of the run in a folder, and that the options given agree with them."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from experiments import run_folder
+from experiments.command_line import UsageError
+
+
+def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -> dict[str, Any]:
+    """The choices of the run in `folder`, with `demos` as a path. Raises `UsageError` where `given` disagrees."""
+    if folder is None:
+        raise UsageError(f"--resume: needs {option} with the folder of the run to continue")
+    if not (folder / "config.json").is_file():
+        raise UsageError(f"--resume: {folder} holds no run (no config.json); leave --resume out or correct {option}")
+    run = run_folder.read_run(folder)
+    demos = run.facts["demonstrations"]
+    saved = {
+        **dataclasses.asdict(run.config),
+        **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
+        **run.facts["env_options"],
+        "env": run.facts["task"],
+        "num_demos": demos["num_episodes"] if demos else None,
+    }
+    for name, value in given.items():
+        if name != "demos" and value != saved[name]:
+            raise UsageError(
+                f"--{name.replace('_', '-')} {value}: the run in {folder} has {saved[name]}; leave it out to resume"
+            )
+    # A file that was moved may be named again: its digest decides.
+    path: Path | None = given.get("demos", Path(demos["file"]) if demos else None)
+    if path and path.is_file() and demos and run_folder.sha256(path) != demos["sha256"]:
+        raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")
+    return {**saved, "demos": path}

@@ -1,0 +1,213 @@
+"""The folder of one training run: config.json, metrics.csv, summary.json, checkpoints/, figures/, TensorBoard events."""
+
+import csv
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from ccil_jax.config import Config
+from experiments.command_line import UsageError
+
+METRICS = (  # order of the columns; a method leaves out those that it lacks
+    "env_steps",
+    "episode_return",
+    "episode_cost",
+    "cost_rate",
+    "episode_length",
+    "episodes_finished",
+    "multiplier",
+    "meta_gradient",
+    "kl",
+    "surrogate",
+    "step_fraction",
+    "entropy",
+    "imitation_reward",
+    "discriminator_loss",
+    "discriminator_accuracy_expert",
+    "discriminator_accuracy_learner",
+    "discriminator_accuracy_held_out",
+    "reward_critic_loss",
+    "cost_critic_loss",
+)
+_FACTS = frozenset(
+    ("task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations")
+    + ("expert_return", "expert_cost", "expert_length")
+)
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes strict JSON, whole or not at all; numbers that are not finite become null."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in `path`. Raises `UsageError` if it is missing or damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read ({error.strerror}); give a folder that `train` wrote") from None
+    except ValueError:
+        raise UsageError(f"{path}: not JSON; the run folder is damaged, restore or repeat the run") from None
+    if not isinstance(content, dict):
+        raise UsageError(f"{path}: not a JSON object; the run folder is damaged, restore or repeat the run")
+    return content
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What config.json says."""
+
+    folder: Path
+    config: Config
+    facts: dict[str, Any]  # task, physics, env_options, seeds, demonstrations, ...
+
+
+def read_run(folder: Path) -> Run:
+    """Reads config.json. Raises `UsageError` if it is missing, damaged or of another version."""
+    path = folder / "config.json"
+    facts = read_json(path)
+    fields = facts.pop("config", None)
+    names = {f.name for f in dataclasses.fields(Config)}
+    if not isinstance(fields, dict) or not _FACTS <= set(facts):
+        raise UsageError(f"{path}: keys are missing; give a folder that this version's `train` or `expert` wrote")
+    if unknown := sorted(set(fields) - names):
+        raise UsageError(f"{path}: field '{unknown[0]}' is not known to this version; use the version that wrote it")
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+    return Run(folder, Config(**values), facts)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def git_commit() -> str | None:
+    """Commit of the source tree, with `-dirty` after it where files differ; None outside a checkout."""
+    try:
+        if _git("rev-parse", "--show-prefix") != f"{Path(__file__).parent.name}/":
+            return None  # installed inside somebody else's checkout
+        head = _git("rev-parse", "HEAD")
+        changed = _git("status", "--porcelain", "--untracked-files=no")
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return head + ("-dirty" if changed else "")
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", *arguments]
+    folder = Path(__file__).parent
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+
+
+def sha256(path: Path) -> str:
+    """Digest of a file's bytes, hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:
+    """config.json: `facts` (task, physics, command, seeds, demonstrations, device), versions, and every field."""
+    content = {**facts, "versions": versions(), "git_commit": git_commit(), "config": dataclasses.asdict(config)}
+    write_json(folder / "config.json", content)
+
+
+def read_metrics(folder: Path) -> dict[str, np.ndarray]:
+    """metrics.csv as `{name: [num_iterations, num_seeds]}`. Raises `UsageError` if it is missing or ragged."""
+    path = folder / "metrics.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.reader(file)
+            names = next(reader)
+            table = np.array([[float(x) if x else math.nan for x in row] for row in reader], np.float64)
+        num_seeds = int(table[:, 1].max()) + 1
+        shaped = table.reshape(-1, num_seeds, len(names))
+    except (OSError, StopIteration, ValueError, IndexError):
+        raise UsageError(f"{path}: missing, empty or damaged; give a run folder with at least one iteration") from None
+    return {name: shaped[:, :, i] for i, name in enumerate(names) if name not in ("iteration", "seed")}
+
+
+class MetricsWriter:
+    """Appends to metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        from tensorboardX import SummaryWriter  # here: it imports protobuf, which no argument error should wait for
+
+        self.path = folder / "metrics.csv"
+        self._events: Any = SummaryWriter(logdir=str(folder))
+        self._names: list[str] | None = None
+
+    def write(self, iteration: int, metrics: Mapping[str, np.ndarray]) -> None:
+        """Adds rows `[chunk, num_seeds]`; `iteration` is the number of iterations finished with the chunk's last."""
+        chunk, num_seeds = metrics["env_steps"].shape
+        if self._names is None:
+            self._begin(iteration - chunk, metrics)
+        rows = np.stack([np.asarray(metrics[name], np.float64) for name in self._names or ()], axis=-1)
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            for i in range(chunk):
+                number = iteration - chunk + i + 1
+                writer.writerows([number, s, *(f"{x:.9g}" for x in rows[i, s])] for s in range(num_seeds))
+                self._write_events(rows[i])
+
+    def _begin(self, first: int, metrics: Mapping[str, np.ndarray]) -> None:
+        """Starts the file, or cuts off the rows after iteration `first`, which a resumed run does again."""
+        known = [name for name in METRICS if name in metrics]
+        self._names = known + sorted(set(metrics) - set(known))
+        header = ",".join(["iteration", "seed", *self._names])
+        kept = [header]
+        if first > 0 and self.path.is_file():
+            lines = self.path.read_text(encoding="utf-8").splitlines()
+            if lines[:1] != [header]:
+                raise UsageError(f"{self.path}: columns differ from this version's; resume with the version that began")
+            kept += [line for line in lines[1:] if int(line.split(",", 1)[0]) <= first]
+        temporary = self.path.with_name(".metrics.csv.tmp")
+        temporary.write_text("\n".join(kept) + "\n", encoding="utf-8")
+        os.replace(temporary, self.path)
+
+    def _write_events(self, row: np.ndarray) -> None:
+        names = self._names or []
+        steps = int(row[0, names.index("env_steps")])
+        for i, name in enumerate(names):
+            if name != "env_steps":
+                self._events.add_scalar(f"mean/{name}", row[:, i].mean(), steps)
+                for seed, value in enumerate(row[:, i]):
+                    self._events.add_scalar(f"seed_{seed}/{name}", value, steps)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._events.close()

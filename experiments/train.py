@@ -1,0 +1,111 @@
+"""Trains one method on one task, all seeds in one program, and writes a run folder with figures and a table."""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.config import IMITATION_METHODS, METHOD_NAMES, Config
+from ccil_jax.demonstrations import Demonstrations, check_matches, load_demonstrations
+from envs.registry import TaskInfo
+from experiments import command_line, options
+from experiments.command_line import Parser, UsageError
+from experiments.resuming import resumed
+from experiments.training import Plan, execute
+
+
+def make_parser() -> Parser:
+    """Options that are not given stay absent, so that --resume can tell them from their defaults."""
+    parser = Parser("train", __doc__ or "")
+    absent = argparse.SUPPRESS
+    parser.add_argument("--method", default=absent, metavar="NAME", help=f"one of {', '.join(METHOD_NAMES)}")
+    options.add_run_options(parser)
+    parser.add_argument(
+        "--demos", default=absent, type=Path, metavar="FILE", help="demonstrations (default: those shipped for --env)"
+    )
+    parser.add_argument(
+        "--num-demos", default=absent, type=command_line.positive, metavar="K", help="use the first K trajectories only"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/<task>_<method>_<time>)")
+    parser.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
+    options.add_config_options(parser, hide=("method",))
+    return parser
+
+
+def make_plan(arguments: argparse.Namespace) -> Plan:
+    """Turns the options into a `Plan`. Raises `UsageError`, `ConfigError` or `DemonstrationsError` for wrong input."""
+    given = {k: v for k, v in vars(arguments).items() if k not in ("out", "resume")}
+    if arguments.resume:
+        given = resumed(arguments.out, given)
+    elif "method" not in given:
+        raise UsageError(f"--method: required; one of {', '.join(METHOD_NAMES)}")
+    choices = {**options.DEFAULTS, "env": None, "demos": None, "num_demos": None, **given}
+    config = options.config_from(choices, choices["preset"])
+    task = options.find_task(choices["env"])
+    env_options = options.env_options(choices, task)
+    path, demonstrations = find_demonstrations(config, task, choices["demos"], choices["num_demos"], env_options)
+    folder = arguments.out or command_line.default_folder(task.name, config.method)
+    command_line.check_output_folder(folder, resume=arguments.resume)
+    return Plan(
+        config=config,
+        preset=choices["preset"],
+        task=task.name,
+        physics=choices["physics"],
+        env_options=env_options,
+        demonstrations=demonstrations,
+        demonstrations_path=path,
+        num_seeds=choices["num_seeds"],
+        seed=choices["seed"],
+        folder=folder,
+        resume=arguments.resume,
+        eval_episodes=choices["eval_episodes"],
+        command=command_line.command(),
+    )
+
+
+def find_demonstrations(
+    config: Config, task: TaskInfo, path: Path | None, count: int | None, env_options: Mapping[str, Any]
+) -> tuple[Path | None, Demonstrations | None]:
+    """Loads and checks the demonstrations that the method needs; the shipped file where `path` is None."""
+    if path is None:
+        if config.method not in IMITATION_METHODS:
+            return None, None
+        path = _shipped(task.name)
+    demonstrations = load_demonstrations(path)
+    check_matches(demonstrations, path, task)
+    for name, used in env_options.items():  # the expert's cost means nothing under another definition of cost
+        recorded = demonstrations.metadata.get(name, used)
+        if recorded != used:
+            option = f"--{name.replace('_', '-')} {recorded}".lower()
+            raise UsageError(f"{path}: recorded with {name} {recorded}, this run has {used}; use {option}")
+    if count is not None and count > demonstrations.num_episodes:
+        raise UsageError(f"--num-demos {count}: {path} holds {demonstrations.num_episodes}; give at most that many")
+    return path, demonstrations if count is None else demonstrations.take_episodes(count)
+
+
+def _shipped(task: str) -> Path:
+    folder = Path(str(resources.files("experiments"))) / "demonstrations"
+    path = folder / f"{task}.npz"
+    if not path.is_file():
+        names = ", ".join(sorted(p.stem for p in folder.glob("*.npz"))) or "none"
+        raise UsageError(
+            f"--demos: no demonstrations are shipped for {task} (shipped: {names}); "
+            f"record some with `python -m experiments.expert --env {task}` and give the file"
+        )
+    return path
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Checks everything, then trains."""
+    execute(make_plan(arguments))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

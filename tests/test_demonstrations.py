@@ -1,0 +1,320 @@
+"""The demonstrations' arithmetic, the file's round trip, and every defect that a file can have."""
+
+import dataclasses
+import io
+import json
+import os
+import pickle
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ccil_jax import npz
+from ccil_jax.demonstrations import (
+    Demonstrations,
+    DemonstrationsError,
+    check_matches,
+    load_demonstrations,
+    save_demonstrations,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    name: str = "Swimmer"
+    obs_dim: int = 8
+    action_dim: int = 2
+
+
+def make(**changes: Any) -> Demonstrations:
+    """Three episodes of 2, 3 and 1 steps."""
+    fields: dict[str, Any] = {
+        "obs": np.arange(48, dtype=np.float32).reshape(6, 8),
+        "actions": np.linspace(-1, 1, 12, dtype=np.float32).reshape(6, 2),
+        "rewards": np.array([1, 2, 3, 4, 5, 6], np.float32),
+        "costs": np.array([0, 1, 1, 0, 1, 0], np.float32),
+        "terminated": np.array([0, 1, 0, 0, 0, 0], bool),
+        "truncated": np.array([0, 0, 0, 0, 1, 1], bool),
+        "episode_ends": np.array([2, 5, 6]),
+        "metadata": {"task": "Swimmer", "method": "expert"},
+    }
+    return Demonstrations(**{**fields, **changes})
+
+
+def arrays_of(demonstrations: Demonstrations) -> dict[str, Any]:
+    """What a sound file holds, key by key."""
+    arrays = {f.name: getattr(demonstrations, f.name) for f in dataclasses.fields(demonstrations)}
+    return {**arrays, "metadata": np.array(json.dumps(demonstrations.metadata))}
+
+
+def write(path: Path, remove: str | None = None, **changes: Any) -> Path:
+    """A file with some keys changed or removed, written past our own checks."""
+    arrays = {**arrays_of(make()), **changes}
+    np.savez(path, allow_pickle=True, **{k: v for k, v in arrays.items() if k != remove})
+    return path
+
+
+def test_derived_numbers_are_sums_over_episodes() -> None:
+    demonstrations = make()
+    assert demonstrations.num_episodes == 3
+    np.testing.assert_array_equal(demonstrations.episode_lengths, [2, 3, 1])
+    np.testing.assert_array_equal(demonstrations.episode_returns, [3, 12, 6])
+    np.testing.assert_array_equal(demonstrations.episode_costs, [1, 2, 0])
+    assert demonstrations.mean_episode_cost == 1.0
+    assert demonstrations.mean_episode_return == 7.0
+    assert demonstrations.mean_episode_length == 2.0
+
+
+def test_without_rewards_there_are_no_returns(tmp_path: Path) -> None:
+    save_demonstrations(tmp_path / "d.npz", make(rewards=None))
+    loaded = load_demonstrations(tmp_path / "d.npz")
+    assert loaded.rewards is None
+    assert loaded.episode_returns is None
+    assert loaded.mean_episode_return is None
+    assert loaded.take_episodes(1).rewards is None
+
+
+def test_take_episodes_keeps_the_first_whole_ones() -> None:
+    taken = make().take_episodes(2)
+    np.testing.assert_array_equal(taken.episode_ends, [2, 5])
+    np.testing.assert_array_equal(taken.obs, make().obs[:5])
+    np.testing.assert_array_equal(taken.episode_costs, [1, 2])
+    for count in (0, 4):
+        with pytest.raises(DemonstrationsError, match="between 1 and 3"):
+            make().take_episodes(count)
+
+
+def test_file_round_trip_is_exact_and_reproducible(tmp_path: Path) -> None:
+    saved = make()
+    save_demonstrations(tmp_path / "a.npz", saved)
+    save_demonstrations(tmp_path / "b.npz", load_demonstrations(tmp_path / "a.npz"))
+    loaded = load_demonstrations(str(tmp_path / "b.npz"))
+    for field in dataclasses.fields(saved):
+        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(saved, field.name))
+    assert loaded.obs.dtype == loaded.actions.dtype == loaded.costs.dtype == np.float32
+    assert loaded.metadata == saved.metadata
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "b.npz"]  # no temporary file is left
+
+
+def test_other_layouts_of_sound_data_are_read(tmp_path: Path) -> None:
+    text = np.frombuffer(json.dumps({"task": "Swimmer"}).encode(), np.uint8)
+    obs = np.asfortranarray(make().obs.astype(np.float64))
+    loaded = load_demonstrations(write(tmp_path / "d.npz", obs=obs, costs=np.ones(6, np.int32), metadata=text))
+    np.testing.assert_array_equal(loaded.obs, make().obs)
+    np.testing.assert_array_equal(loaded.costs, np.ones(6))
+    assert loaded.metadata == {"task": "Swimmer"}
+
+
+def test_numpy_reads_our_files_without_pickle(tmp_path: Path) -> None:
+    save_demonstrations(tmp_path / "d.npz", make())
+    with np.load(tmp_path / "d.npz", allow_pickle=False) as file:
+        assert set(file) == {f.name for f in dataclasses.fields(Demonstrations)}
+        assert json.loads(str(file["metadata"]))["task"] == "Swimmer"
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "d.npz"
+    save_demonstrations(path, make())
+    before = path.read_bytes()
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_demonstrations(path, make(costs=np.zeros(6)))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_saving_refuses_what_loading_would_refuse(tmp_path: Path) -> None:
+    for changes in ({"costs": -np.ones(6)}, {"metadata": {"x": object()}}, {"metadata": {"x": float("nan")}}):
+        with pytest.raises(DemonstrationsError, match=r"d\.npz: '(costs|metadata)'"):
+            save_demonstrations(tmp_path / "d.npz", make(**changes))
+    with pytest.raises(DemonstrationsError, match=r"named \*\.npz"):
+        save_demonstrations(tmp_path / "d.h5", make())
+
+
+def nan_at(array: np.ndarray, row: int, value: float = np.nan) -> np.ndarray:
+    array = array.copy()
+    array[row] = value
+    return array
+
+
+BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
+    "missing key": ({"remove": "costs"}, "key 'costs' is missing"),
+    "missing metadata": ({"remove": "metadata"}, "key 'metadata' is missing"),
+    "rank": ({"obs": np.zeros(48)}, "'obs' has shape"),
+    "no columns": ({"actions": np.zeros((6, 0))}, "'actions' has no columns"),
+    "text": ({"obs": np.full((6, 8), "x")}, "'obs' has dtype"),
+    "complex": ({"costs": np.zeros(6, complex)}, "'costs' has dtype"),
+    "flags as numbers": ({"terminated": np.zeros(6)}, "'terminated' has dtype"),
+    "ends as floats": ({"episode_ends": np.array([2.0, 5.0, 6.0])}, "'episode_ends' has dtype"),
+    "lengths": ({"actions": np.zeros((5, 2))}, "'actions' has 5 rows, 'obs' has 6"),
+    "empty": (
+        {
+            "obs": np.zeros((0, 8)),
+            "actions": np.zeros((0, 2)),
+            "rewards": np.zeros(0),
+            "costs": np.zeros(0),
+            "terminated": np.zeros(0, bool),
+            "truncated": np.zeros(0, bool),
+            "episode_ends": np.zeros(0, int),
+        },
+        "'obs' is empty",
+    ),
+    "zero episodes": ({"episode_ends": np.zeros(0, int)}, "zero episodes"),
+    "empty episode": ({"episode_ends": np.array([2, 2, 6])}, "does not increase at trajectory 1"),
+    "decreasing": ({"episode_ends": np.array([5, 2, 6])}, "does not increase at trajectory 1"),
+    "first empty": ({"episode_ends": np.array([0, 6])}, "does not increase at trajectory 0"),
+    "short cover": ({"episode_ends": np.array([2, 5])}, "covers 5 of 6 rows"),
+    "long cover": ({"episode_ends": np.array([2, 5, 7])}, "covers 7 of 6 rows"),
+    "nan": ({"obs": nan_at(make().obs, 3)}, r"'obs' holds NaN or infinity.*trajectory 1, row 3"),
+    "inf": ({"actions": nan_at(make().actions, 5, np.inf)}, r"'actions' holds NaN.*trajectory 2, row 5"),
+    "too large for float32": ({"costs": np.full(6, 1e300)}, "'costs' holds NaN or infinity"),
+    "nan reward": ({"rewards": np.full(6, np.nan)}, r"'rewards' holds NaN.*row 0"),
+    "negative cost": ({"costs": nan_at(make().costs, 2, -1)}, r"'costs' is negative.*trajectory 1, row 2"),
+    "done inside": ({"terminated": np.ones(6, bool)}, r"'terminated' is true before.*trajectory 0, row 0"),
+    "metadata not json": ({"metadata": np.array("{")}, "'metadata' is not a JSON object"),
+    "metadata a list": ({"metadata": np.array("[1]")}, "'metadata' is not a JSON object"),
+    "metadata bytes": ({"metadata": np.array([255, 254], np.uint8)}, "'metadata' is not a JSON object"),
+    "metadata deep": ({"metadata": np.array("[" * 100_000)}, "'metadata' is not a JSON object"),
+    "objects": ({"obs": np.full((6, 8), None)}, "'obs' holds pickled objects.*could execute code"),
+    "object metadata": ({"metadata": np.array({"task": 1}, object)}, "'metadata' holds pickled objects"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARRAYS)
+def test_bad_arrays_end_in_one_line(tmp_path: Path, case: str) -> None:
+    changes, message = BAD_ARRAYS[case]
+    path = write(tmp_path / "bad.npz", **changes)
+    with pytest.raises(DemonstrationsError, match=message) as error:
+        load_demonstrations(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+class Payload:
+    """Unpickling it makes a directory named canary."""
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, ("canary",)
+
+
+def _lying_header(path: Path) -> None:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (2000000000000, 1), }\n"
+    member = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + b"\0" * 64
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("obs.npy", member)
+
+
+def _bomb(path: Path) -> None:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("obs.npy", "w") as member:
+        for _ in range(64):
+            member.write(bytes(1024**2))
+
+
+def _npy(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def _not_arrays(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("obs.npy", b"hello")
+
+
+def _flipped(path: Path) -> None:
+    content = bytearray(write(path).read_bytes())
+    content[200] ^= 1
+    path.write_bytes(content)
+
+
+def _truncated(path: Path) -> None:
+    path.write_bytes(write(path).read_bytes()[:-300])
+
+
+BAD_FILES: dict[str, tuple[Any, str]] = {
+    "missing": (lambda path: None, "no such file"),
+    "directory": (lambda path: path.mkdir(), "not a file"),
+    "zero bytes": (lambda path: path.write_bytes(b""), "0 bytes"),
+    "text": (lambda path: path.write_text("obs,actions\n1,2\n"), "not an .npz archive"),
+    "npy": (_npy, "not an .npz archive"),
+    "truncated": (_truncated, "truncated or damaged"),
+    "only a signature": (lambda path: path.write_bytes(b"PK\x03\x04"), "truncated or damaged"),
+    "flipped bit": (_flipped, "truncated or damaged"),
+    "not arrays": (_not_arrays, "'obs' is truncated or damaged"),
+    "raw pickle": (lambda path: path.write_bytes(pickle.dumps(Payload())), "could execute code"),
+    "pickled payload": (lambda path: write(path, obs=np.array([Payload()], object)), "could execute code"),
+    "header that lies": (_lying_header, "declares shape|truncated or damaged"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_bad_files_end_in_one_line(tmp_path: Path, case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "bad.npz"
+    build, message = BAD_FILES[case]
+    build(path)
+    with pytest.raises(DemonstrationsError, match=message) as error:
+        load_demonstrations(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "canary").exists()
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _bomb(tmp_path / "bad.npz")
+    assert (tmp_path / "bad.npz").stat().st_size < 100_000
+    monkeypatch.setattr(npz, "MAX_BYTES", 10 * 1024**2)
+    with pytest.raises(DemonstrationsError, match="unpacks to 67108864 bytes, limit 10485760"):
+        load_demonstrations(tmp_path / "bad.npz")
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.tuples(st.integers(0, 5000), st.integers(0, 255)), min_size=1, max_size=8), st.booleans())
+def test_no_mutation_raises_anything_else(tmp_path: Path, edits: list[tuple[int, int]], cut: bool) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays_of(make()))
+    content = bytearray(buffer.getvalue())
+    for position, value in edits:
+        content[position % len(content)] = value
+    path = tmp_path / "mutated.npz"
+    path.write_bytes(content[: edits[0][0]] if cut else content)
+    try:
+        load_demonstrations(path)
+    except DemonstrationsError as error:
+        assert "\n" not in str(error)
+
+
+def test_files_of_another_task_or_size_are_refused() -> None:
+    check_matches(make(), "d.npz", Task())
+    check_matches(make(metadata={}), "d.npz", Task())  # converted files may not name their task
+    with pytest.raises(DemonstrationsError, match=r"d\.npz: recorded on task 'Swimmer', not 'Ant'; use --env Swimmer"):
+        check_matches(make(), "d.npz", Task(name="Ant"))
+    with pytest.raises(DemonstrationsError, match=r"d\.npz: 'obs' has 8 columns, Swimmer has obs_dim 17"):
+        check_matches(make(), "d.npz", Task(obs_dim=17))
+    with pytest.raises(DemonstrationsError, match=r"d\.npz: 'actions' has 2 columns, Swimmer has action_dim 6"):
+        check_matches(make(), "d.npz", Task(action_dim=6))
+
+
+def test_importing_the_package_imports_no_jax() -> None:
+    code = "import ccil_jax, sys; ccil_jax.load_demonstrations, ccil_jax.Config; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_public_names_resolve() -> None:
+    import ccil_jax
+
+    assert all(getattr(ccil_jax, name) is not None for name in ccil_jax.__all__)
+    assert set(ccil_jax.__all__) <= set(dir(ccil_jax))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        getattr(ccil_jax, "nothing")  # noqa: B009  (a misspelt name, as a type checker would not let it pass)
