@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 from ccil_jax.types import PyTree
@@ -17,7 +18,8 @@ class Checkpointer:
     def __init__(self, directory: Path) -> None:
         # Orbax fails in the background on a relative path.
         options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, create=True)
-        self._manager = ocp.CheckpointManager(directory.resolve(), options=options)
+        handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
+        self._manager = ocp.CheckpointManager(directory.resolve(), options=options, item_handlers=handler)
 
     def __enter__(self) -> "Checkpointer":
         return self
@@ -34,13 +36,13 @@ class Checkpointer:
         self._manager.save(step, args=ocp.args.StandardSave(state))
 
     def restore(self, step: int, like: PyTree) -> PyTree:
-        """The state saved at `step`; `like` gives structure, shapes and dtypes (arrays or ShapeDtypeStructs)."""
-        abstract = jax.eval_shape(lambda tree: tree, like)
-        return self._manager.restore(step, args=ocp.args.StandardRestore(abstract))
+        """The state saved at `step`; `like` gives structure, shapes, dtypes and shardings."""
+        return self._manager.restore(step, args=ocp.args.StandardRestore(like))
 
     def structure(self, step: int) -> PyTree:
-        """Shapes and dtypes of what was saved at `step`."""
-        return self._manager.item_metadata(step)
+        """What was saved at `step`, as empty NumPy arrays of its shapes and dtypes."""
+        metadata = self._manager.item_metadata(step)
+        return jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
 
     def close(self) -> None:
         """Waits for saves in flight."""

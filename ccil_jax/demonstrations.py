@@ -29,11 +29,16 @@ class TaskInfo(Protocol):
     """What `check_matches` needs to know of a task."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Key of `envs.TASKS`."""
+
     @property
-    def obs_dim(self) -> int: ...
+    def obs_dim(self) -> int:
+        """Entries of an observation."""
+
     @property
-    def action_dim(self) -> int: ...
+    def action_dim(self) -> int:
+        """Entries of an action."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

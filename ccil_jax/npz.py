@@ -75,15 +75,16 @@ def read(
 def write(path: Path, arrays: Mapping[str, Any]) -> None:
     """Writes a compressed archive, whole or not at all; equal arrays give equal bytes. Raises `OSError`."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".tmp")
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".tmp")
+    temporary = Path(name)
     try:
         with os.fdopen(handle, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
-        os.chmod(temporary, 0o644)  # mkstemp's 0600 would hide a shared file from its readers
-        os.replace(temporary, path)
+        temporary.chmod(0o644)  # mkstemp's 0600 would hide a shared file from its readers
+        temporary.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
-            os.unlink(temporary)
+            temporary.unlink()
         raise
 
 

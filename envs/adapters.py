@@ -96,7 +96,7 @@ def to_brax(env: Any) -> Any:
     """
     import brax.envs
 
-    class BraxEnvironment(brax.envs.Env):
+    class BraxEnvironment(brax.envs.Env):  # type: ignore[misc]  # brax is untyped
         """See `to_brax`."""
 
         observation_size = env.obs_dim

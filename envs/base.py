@@ -37,17 +37,28 @@ class Environment(Protocol):
     """What a learner may assume. Actions outside `[action_low, action_high]` are clipped by `step`."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The task's name."""
+
     @property
-    def obs_dim(self) -> int: ...
+    def obs_dim(self) -> int:
+        """Length of `State.obs`."""
+
     @property
-    def action_dim(self) -> int: ...
+    def action_dim(self) -> int:
+        """Length of an action."""
+
     @property
-    def action_low(self) -> jax.typing.ArrayLike: ...
+    def action_low(self) -> jax.typing.ArrayLike:
+        """[action_dim] lower bounds."""
+
     @property
-    def action_high(self) -> jax.typing.ArrayLike: ...
+    def action_high(self) -> jax.typing.ArrayLike:
+        """[action_dim] upper bounds."""
+
     @property
-    def max_episode_steps(self) -> int: ...
+    def max_episode_steps(self) -> int:
+        """Control steps until truncation."""
 
     def reset(self, key: jax.Array) -> State:
         """Starts an episode from the task's own random distribution. `key` is consumed."""

@@ -9,15 +9,16 @@ Where they depart from `-v5`, on purpose:
 """
 
 import importlib.util
-import os
+import pathlib
 
 import jax
 import jax.numpy as jnp
 import mujoco
+from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
 from envs.base import State
-from envs.locomotion_tasks import TABLE
+from envs.locomotion_tasks import TABLE, CostInputs
 from envs.registry import TASKS
 
 
@@ -81,7 +82,7 @@ class Locomotion:
             qvel = jax.random.uniform(qvel_key, (model.nv,), minval=-task.qvel_noise, maxval=task.qvel_noise)
         return self.reset_to(jnp.asarray(model.qpos0, noise.dtype) + noise, qvel)
 
-    def reset_to(self, qpos: jax.Array, qvel: jax.Array) -> State:
+    def reset_to(self, qpos: ArrayLike, qvel: ArrayLike) -> State:
         """Starts an episode at `qpos` `[nq]`, `qvel` `[nv]`."""
         data = self._physics.init(qpos, qvel)
         zero = jnp.zeros((), data.qpos.dtype)
@@ -105,7 +106,9 @@ class Locomotion:
         obs = self._observe(data)
         velocity, terms = self._terms(data, action)
         reward = sum((terms[name] for name in self.task.reward_terms), start=jnp.zeros_like(state.reward))
-        quantity = self.task.cost_quantity(velocity, -terms["control"], -terms["contact"])
+        quantity = self.task.cost_quantity(
+            CostInputs(velocity=velocity, control_cost=-terms["control"], contact_cost=-terms["contact"])
+        )
         cost = (quantity > self.cost_threshold).astype(state.cost.dtype)
         finite = jnp.isfinite(obs).all() & jnp.isfinite(reward) & jnp.isfinite(quantity)
         reward, cost = jnp.where(finite, reward, 0.0), jnp.where(finite, cost, 0.0)
@@ -160,9 +163,9 @@ def load_model(xml: str) -> mujoco.MjModel:
     package = importlib.util.find_spec("gymnasium")  # located, not imported: only its files are needed
     if package is None or package.origin is None:
         raise ImportError("the locomotion tasks need the model files of the package gymnasium: install it")
-    path = os.path.join(os.path.dirname(package.origin), "envs", "mujoco", "assets", xml)
-    mujoco.set_mju_user_warning(lambda message: None)
+    path = pathlib.Path(package.origin).parent / "envs" / "mujoco" / "assets" / xml
+    mujoco.set_mju_user_warning(lambda _: None)
     try:
-        return mujoco.MjModel.from_xml_path(path)
+        return mujoco.MjModel.from_xml_path(str(path))
     finally:
         mujoco.set_mju_user_warning(None)

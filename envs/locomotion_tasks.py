@@ -6,12 +6,24 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import mujoco
+from flax import struct
 
 from envs.physics import Data
 
 Velocity = Callable[[mujoco.MjModel, Data], jax.Array]
 Healthy = Callable[[jax.Array, jax.Array], jax.Array]
-Quantity = Callable[[jax.Array, jax.Array, jax.Array], jax.Array]
+
+
+@struct.dataclass(kw_only=True)
+class CostInputs:
+    """What a cost may depend on."""
+
+    velocity: jax.Array  # [2] of the root in m/s
+    control_cost: jax.Array  # [] the task's weight times the sum of squared actions
+    contact_cost: jax.Array  # [] zero where the contact term is switched off
+
+
+Quantity = Callable[[CostInputs], jax.Array]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,7 +43,7 @@ class LocomotionTask:
     healthy: Healthy | None = None  # of (qpos, qvel); None: always, and the task never terminates
     reward_terms: tuple[str, ...] = ("forward", "healthy")  # the authors' reward is the sum of these
     contact: Callable[[jax.Array], jax.Array] | None = None  # contact cost of cfrc_ext
-    cost_quantity: Quantity  # of (velocity [2], control cost, contact cost)
+    cost_quantity: Quantity  # the cost is 1 where it exceeds the threshold
     qpos_noise: float  # uniform on +-
     qvel_noise: float
     qvel_normal: bool = False  # normal with sd `qvel_noise` instead of uniform
@@ -90,7 +102,7 @@ TABLE = {
         displacement=_first_two_coordinates,
         control_weight=1e-4,
         reward_terms=("forward", "control"),
-        cost_quantity=lambda velocity, control, contact: jnp.linalg.norm(velocity),
+        cost_quantity=lambda x: jnp.linalg.norm(x.velocity),
         qpos_noise=0.1,
         qvel_noise=0.1,
     ),
@@ -102,7 +114,7 @@ TABLE = {
         displacement=_first_coordinate,
         control_weight=0.1,
         reward_terms=("forward",),
-        cost_quantity=lambda velocity, control, contact: control,
+        cost_quantity=lambda x: x.control_cost,
         qpos_noise=0.1,
         qvel_noise=0.1,
         qvel_normal=True,
@@ -117,7 +129,7 @@ TABLE = {
         control_weight=1e-3,
         healthy_reward=1.0,
         healthy=_hopper_healthy,
-        cost_quantity=lambda velocity, control, contact: 1000.0 * control,
+        cost_quantity=lambda x: 1000.0 * x.control_cost,
         qpos_noise=5e-3,
         qvel_noise=5e-3,
     ),
@@ -132,7 +144,7 @@ TABLE = {
         healthy_reward=1.0,
         healthy=_walker_healthy,
         reward_terms=("forward", "healthy", "control"),
-        cost_quantity=lambda velocity, control, contact: jnp.abs(velocity[0]),
+        cost_quantity=lambda x: jnp.abs(x.velocity[0]),
         qpos_noise=5e-3,
         qvel_noise=5e-3,
     ),
@@ -146,7 +158,7 @@ TABLE = {
         healthy_reward=1.0,
         healthy=_ant_healthy,
         contact=lambda force: 5e-4 * jnp.square(jnp.clip(force, -1.0, 1.0)).sum(),
-        cost_quantity=lambda velocity, control, contact: control + contact,
+        cost_quantity=lambda x: x.control_cost + x.contact_cost,
         qpos_noise=0.1,
         qvel_noise=0.1,
         qvel_normal=True,
@@ -163,7 +175,7 @@ TABLE = {
         healthy_reward=5.0,
         healthy=_humanoid_healthy,
         contact=lambda force: jnp.minimum(5e-7 * jnp.square(force).sum(), 10.0),
-        cost_quantity=lambda velocity, control, contact: control + contact,
+        cost_quantity=lambda x: x.control_cost + x.contact_cost,
         qpos_noise=1e-2,
         qvel_noise=1e-2,
     ),

@@ -13,7 +13,7 @@ def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:
     """Checks what every environment owes its learner: shapes, types, finiteness, structure, purity, totals.
 
     Args:
-        env: an `Environment`; where it has `action_low` and `action_high`, that `step` clips is checked too.
+        env: an `Environment`.
         num_envs: episodes, each with its own key.
         num_steps: random actions per episode, within [-2, 2].
 
@@ -40,20 +40,23 @@ def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:
         lead = state.obs.shape[:-1]
         for name in ("reward", "cost", "episode_return", "episode_cost"):
             value = getattr(state, name)
-            assert value.shape == lead and value.dtype == state.obs.dtype == jnp.result_type(float), name
+            assert value.shape == lead, name
+            assert value.dtype == state.obs.dtype == jnp.result_type(float), name
         assert state.terminated.shape == state.truncated.shape == state.step_count.shape == lead
-        assert state.terminated.dtype == state.truncated.dtype == bool and state.step_count.dtype == jnp.int32
+        assert state.terminated.dtype == state.truncated.dtype == bool
+        assert state.step_count.dtype == jnp.int32
         assert all(np.isfinite(leaf).all() for leaf in (state.obs, state.reward, state.cost))
         assert all(term.shape == lead for term in state.terms.values())
-    assert not first.reward.any() and not first.cost.any() and not first.done.any() and not first.step_count.any()
+    assert not first.reward.any()
+    assert not first.cost.any()
+    assert not first.done.any()
+    assert not first.step_count.any()
     assert (states.cost >= 0).all()
     assert len(np.unique(first.obs, axis=0)) == num_envs, "every key starts another episode"
     np.testing.assert_array_equal(states.step_count, np.broadcast_to(1 + np.arange(num_steps), (num_envs, num_steps)))
     np.testing.assert_allclose(states.episode_return, np.cumsum(states.reward, axis=1), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(states.episode_cost, np.cumsum(states.cost, axis=1))
     jax.tree.map(np.testing.assert_array_equal, run(keys), once)
-    if not hasattr(env, "action_low"):
-        return
     step = jax.jit(jax.vmap(env.step))
     clipped = step(first, jnp.clip(actions[:, 0], env.action_low, env.action_high))
     jax.tree.map(np.testing.assert_array_equal, clipped, step(first, actions[:, 0]))

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from experiments.original import NumpyPolicy
+from experiments.run_folder import Run
 
 _STEPS_PER_FRAME = 2
 _FROM_ABOVE = frozenset({"Swimmer"})  # the others are seen from the side
@@ -22,9 +23,11 @@ _SCRIPT = """
   const scale = canvas.height / data.span, floor = data.above ? null : canvas.height * 0.88;
   let frame = 0;
   const draw = () => {
-    const bones = data.frames[frame], centre = bones.reduce((sum, b) => sum + b[0] + b[2], 0) / (2 * bones.length);
+    const bones = data.frames[frame];
+    const mean = i => bones.reduce((sum, b) => sum + b[i] + b[i + 2], 0) / (2 * bones.length);
+    const centre = mean(0), middle = mean(1);
     const x = v => (v - centre) * scale + canvas.width / 2;
-    const y = v => floor === null ? canvas.height / 2 - v * scale : floor - v * scale;
+    const y = v => floor === null ? canvas.height / 2 - (v - middle) * scale : floor - v * scale;
     pen.clearRect(0, 0, canvas.width, canvas.height);
     pen.strokeStyle = "#d5d9de"; pen.lineWidth = 1; pen.beginPath();
     for (let m = Math.floor(centre - 9); m < centre + 9; m++) { pen.moveTo(x(m), 0); pen.lineTo(x(m), canvas.height); }
@@ -79,6 +82,19 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
     )
 
 
+def play_run(run: Run, seed: int, caption: str) -> str:
+    """The HTML of an episode of one seed of a run folder."""
+    import jax
+
+    import envs
+    from ccil_jax import runner
+
+    env: Any = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
+    loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
+    policy = NumpyPolicy(run.config, jax.tree.map(lambda leaf: np.asarray(leaf[seed]), loaded.agent))
+    return to_html(record_poses(env, policy), f"episode-{env.name}-{run.folder.resolve().name}", caption)
+
+
 def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> np.ndarray:
     """[G, 2, 3]: both ends of every capsule; a sphere's ends coincide."""
     capsule = model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE
@@ -90,7 +106,8 @@ def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> 
 def to_html(poses: Poses, name: str, caption: str) -> str:
     """A figure that plays the poses in a loop, red where a cost is paid. `name` is unique on the page."""
     heights = poses.frames[:, :, [1, 3]]
-    span = float(np.clip(2.2 * np.abs(heights).max(), 1.6, 8.0))
+    extent = np.ptp(heights, axis=(1, 2)).max() if poses.above else heights.max()
+    span = float(np.clip(1.5 * extent, 1.6, 8.0))  # metres from bottom to top of the canvas
     content = {
         "id": name,
         "frames": np.round(poses.frames, 3).tolist(),

@@ -15,7 +15,7 @@ from typing import Any
 
 from ccil_jax.config import METHOD_NAMES, PRESETS
 from envs.registry import PHYSICS
-from experiments import command_line, options, run_folder
+from experiments import command_line, devices, options, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.summary import show
 
@@ -102,9 +102,11 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measures all rows, prints and writes them."""
     if arguments.row is not None:
+        setting = json.loads(arguments.row)
+        devices.spread_seeds(setting["num_seeds"])  # as training does
         from experiments import measuring  # imports JAX
 
-        print(json.dumps(measuring.measure(measuring.Setting(**json.loads(arguments.row)))))
+        print(json.dumps(measuring.measure(measuring.Setting(**setting))))
         return
     settings = settings_of(arguments)
     command_line.check_writable(arguments.out.parent, "--out")

@@ -94,7 +94,7 @@ def natural(text: str) -> int:
 
 
 def boolean(text: str) -> bool:
-    """true or false, in the usual spellings."""
+    """Truth in the usual spellings."""
     if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
         raise argparse.ArgumentTypeError(f"{text!r}: give true or false")
     return text.lower() in ("true", "yes", "1")

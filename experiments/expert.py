@@ -121,7 +121,7 @@ def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
     from rich.table import Table
 
     returns = demonstrations.episode_returns
-    table = Table(title=f"recorded in {path}", title_justify="left")
+    table = Table(title="recorded demonstrations", title_justify="left")
     for heading in ("", "return", "cost", "steps"):
         table.add_column(heading, justify="right" if heading else "left")
     costs, lengths = demonstrations.episode_costs, demonstrations.episode_lengths
@@ -136,6 +136,7 @@ def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
     if demonstrations.metadata["cost_limit"] is not None:
         table.add_row("limit", "", number(demonstrations.metadata["cost_limit"]), "")
     show(table)
+    print(f"demonstrations  {path}")
 
 
 def run(arguments: argparse.Namespace) -> int:

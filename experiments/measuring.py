@@ -39,10 +39,11 @@ class Setting:
 
 
 def measure(setting: Setting) -> dict[str, Any]:
-    """Measures everything in turn, `rounds` times, and returns medians. Rates are control steps of all seeds per second.
+    """Measures everything in turn, `rounds` times, and returns medians.
 
-    A control step is `frame_skip` engine steps. `physics_steps_per_second` is the C engine alone, stepping as many
-    simulations as training does under random controls: the ceiling of the native backend.
+    Rates are control steps of all seeds per second; a control step is `frame_skip` engine steps.
+    `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does under random
+    controls: the ceiling of the native backend.
     """
     env: Any = envs.make(setting.task, physics=setting.physics)
     config = Config(**{**PRESETS[setting.preset], "method": setting.method, "num_envs": setting.num_envs})
@@ -129,18 +130,21 @@ def _rollout(config: Config, env: Any, setting: Setting) -> Work:
         actor = rollout.Actor(policy_params=policy.init(policy_key), obs_statistics=statistics)
         return actor, rollout.init(env, config.num_envs, env_key)
 
-    @jax.jit
-    @jax.vmap
     def run(actor: Any, state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         state, transition = rollout.rollout(env, policy.apply, actor, state, config.num_steps, key)
         return state, jnp.mean(transition.reward)
 
+    def spread(function: Callable[..., Any]) -> Callable[..., Any]:  # over devices, as training does
+        mesh, spec = runner.seed_mesh(setting.num_seeds), jax.P("seeds")
+        return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+
     keys = jax.random.split(jax.random.key(setting.seed), setting.num_seeds)
-    actor, state = jax.jit(jax.vmap(init))(keys)
+    actor, state = spread(init)(keys)
+    compiled = spread(run)
 
     def work() -> int:
         nonlocal state
-        state, _ = _wait(run(actor, state, keys))
+        state, _ = _wait(compiled(actor, state, keys))
         return setting.num_seeds * config.batch_size
 
     return work

@@ -28,10 +28,10 @@ DEFAULTS: Mapping[str, Any] = {
 def add_run_options(parser: Parser) -> None:
     """Everything in `DEFAULTS` and --env. What is not given is absent from the parsed arguments."""
 
-    def add(name: str, help: str, **settings: Any) -> None:
+    def add(name: str, text: str, **settings: Any) -> None:
         default = DEFAULTS.get(name)
         suffix = "" if default is None else f" (default: {str(default).lower()})"
-        parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, help=help + suffix, **settings)
+        parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, help=text + suffix, **settings)
 
     add("env", f"task: {', '.join(TASKS)}", metavar="TASK")
     add("num_seeds", "seeds trained side by side in one program", type=positive, metavar="S")

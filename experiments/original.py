@@ -80,28 +80,34 @@ def evaluate(
 
     `contact_cost` is the option of that name which `env` was made with.
     """
-    import gymnasium
     import jax
 
-    simulator = gymnasium.make(
-        TASKS[env.name].gymnasium_id,
-        max_episode_steps=env.max_episode_steps,
-        **({"include_cfrc_ext_in_observation": False} if env.name in ("Ant", "Humanoid") else {}),
-    )
+    simulator = make_simulator(env)
     num_seeds = len(actor.obs_statistics.count)
     results = []
     for index in range(num_seeds):
         policy = NumpyPolicy(config, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), actor))
         random = np.random.default_rng([seed, index])
         for episode in range(num_episodes):
-            steps = _run_episode(simulator, policy, random, (seed + episode) % 2**32, deterministic)
-            results.append(_score(env, steps, contact_cost))
+            steps = run_episode(simulator, policy, random, (seed + episode) % 2**32, deterministic)
+            results.append(score(env, steps, contact_cost))
     simulator.close()
     totals = np.array(results).reshape(num_seeds, num_episodes, 3)
     return Totals(totals[..., 0], totals[..., 1], totals[..., 2])
 
 
-def _run_episode(
+def make_simulator(env: Any) -> Any:
+    """Gymnasium's own environment of `env`'s task, with the same observations and time limit."""
+    import gymnasium
+
+    return gymnasium.make(
+        TASKS[env.name].gymnasium_id,
+        max_episode_steps=env.max_episode_steps,
+        **({"include_cfrc_ext_in_observation": False} if env.name in ("Ant", "Humanoid") else {}),
+    )
+
+
+def run_episode(
     simulator: Any, policy: NumpyPolicy, random: np.random.Generator, seed: int, deterministic: bool
 ) -> dict[str, np.ndarray]:
     """What gymnasium reports at each of T steps: `velocity [T, 2]` and the four reward terms `[T]`."""
@@ -119,12 +125,14 @@ def _run_episode(
     return {"velocity": table[:, :2], **{name: table[:, 2 + i] for i, name in enumerate(_TERMS)}}
 
 
-def _score(env: Any, steps: dict[str, np.ndarray], contact_cost: bool) -> tuple[float, float, int]:
+def score(env: Any, steps: dict[str, np.ndarray], contact_cost: bool) -> tuple[float, float, int]:
     """Return, cost and length of an episode under the task's rule."""
     import jax
 
+    from envs.locomotion_tasks import CostInputs
+
     reward = sum(steps[name] for name in env.task.reward_terms)
     contact = -steps["contact"] if contact_cost else np.zeros_like(steps["contact"])
-    quantity = jax.vmap(env.task.cost_quantity)(steps["velocity"], -steps["control"], contact)
-    cost = np.asarray(quantity) > env.cost_threshold
+    inputs = CostInputs(velocity=steps["velocity"], control_cost=-steps["control"], contact_cost=contact)
+    cost = np.asarray(jax.vmap(env.task.cost_quantity)(inputs)) > env.cost_threshold
     return float(np.sum(reward)), float(np.sum(cost)), len(cost)

@@ -101,7 +101,8 @@ def page(entries: Sequence[Entry], *, seed: int = 0, player: Callable[[Entry], s
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width, initial-scale=1'>",
-        f"<title>{_text(', '.join(tasks))}: imitation under cost constraints</title><style>{_STYLE}</style></head><body>",
+        f"<title>{_text(', '.join(tasks))}: imitation under cost constraints</title>",
+        f"<style>{_STYLE}</style></head><body>",
         f"<h1>{_text(', '.join(tasks))}: imitation under cost constraints</h1>",
         f"<p class=note>{_NOTE}</p>",
     ]
@@ -214,23 +215,13 @@ def _text(value: str) -> str:
 
 
 def animate(entry: Entry) -> str:
-    """The HTML of an episode of a run's best seed, or an empty string where the run cannot be loaded."""
-    checkpoints = entry.run.folder.resolve() / "checkpoints"
-    if not checkpoints.is_dir():
+    """The HTML of an episode of a run's best seed, or an empty string for a run without checkpoints."""
+    if not (entry.run.folder / "checkpoints").is_dir():
         return ""
-    import jax
+    from experiments import animation  # imports JAX: only where an episode is asked for
 
-    import envs  # imports JAX: only where an episode is asked for
-    from ccil_jax import runner
-    from experiments import animation, original
-
-    facts, config = entry.run.facts, entry.run.config
-    env = envs.make(facts["task"], physics=facts["physics"], **facts["env_options"])
-    loaded = runner.load(config, env, checkpoints, facts["num_seeds"])
     best = max(entry.summary["per_seed"], key=lambda row: row["episode_return"])["seed"]
-    policy = original.NumpyPolicy(config, jax.tree.map(lambda leaf: np.asarray(leaf[best]), loaded.agent))
-    name = f"episode-{entry.task}-{entry.run.folder.resolve().name}"
-    return animation.to_html(animation.record_poses(env, policy), name, f"{entry.label}, seed {best}.")
+    return animation.play_run(entry.run, best, f"{entry.label}, seed {best}.")
 
 
 def run(arguments: argparse.Namespace) -> None:

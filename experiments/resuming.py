@@ -9,7 +9,10 @@ from experiments.command_line import UsageError
 
 
 def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -> dict[str, Any]:
-    """The choices of the run in `folder`, with `demos` as a path. Raises `UsageError` where `given` disagrees."""
+    """The choices of the run in `folder`, with `demos` as a path. Raises `UsageError` where `given` disagrees.
+
+    Only `env_steps` may differ, upwards: a finished run can be trained for longer.
+    """
     if folder is None:
         raise UsageError(f"--resume: needs {option} with the folder of the run to continue")
     if not (folder / "config.json").is_file():
@@ -24,7 +27,8 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
         "num_demos": demos["num_episodes"] if demos else None,
     }
     for name, value in given.items():
-        if name != "demos" and value != saved[name]:
+        longer = name == "env_steps" and value > saved[name]
+        if name != "demos" and value != saved[name] and not longer:
             raise UsageError(
                 f"--{name.replace('_', '-')} {value}: the run in {folder} has {saved[name]}; leave it out to resume"
             )
@@ -32,4 +36,4 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
     path: Path | None = given.get("demos", Path(demos["file"]) if demos else None)
     if path and path.is_file() and demos and run_folder.sha256(path) != demos["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")
-    return {**saved, "demos": path}
+    return {**saved, "env_steps": given.get("env_steps", saved["env_steps"]), "demos": path}

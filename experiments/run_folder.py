@@ -1,4 +1,4 @@
-"""The folder of one training run: config.json, metrics.csv, summary.json, checkpoints/, figures/, TensorBoard events."""
+"""The folder of one training run: config, metrics, summary, checkpoints, figures, TensorBoard events."""
 
 import csv
 import dataclasses
@@ -41,8 +41,8 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "cost_critic_loss",
 )
 _FACTS = frozenset(
-    ("task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations")
-    + ("expert_return", "expert_cost", "expert_length")
+    {"task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations"}
+    | {"expert_return", "expert_cost", "expert_length"}
 )
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
 
@@ -51,7 +51,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Writes strict JSON, whole or not at all; numbers that are not finite become null."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    temporary.replace(path)
 
 
 def _plain(value: Any) -> Any:
@@ -94,7 +94,7 @@ def read_run(folder: Path) -> Run:
     facts = read_json(path)
     fields = facts.pop("config", None)
     names = {f.name for f in dataclasses.fields(Config)}
-    if not isinstance(fields, dict) or not _FACTS <= set(facts):
+    if not isinstance(fields, dict) or not _FACTS.issubset(facts):
         raise UsageError(f"{path}: keys are missing; give a folder that this version's `train` or `expert` wrote")
     if unknown := sorted(set(fields) - names):
         raise UsageError(f"{path}: field '{unknown[0]}' is not known to this version; use the version that wrote it")
@@ -193,7 +193,7 @@ class MetricsWriter:
             kept += [line for line in lines[1:] if int(line.split(",", 1)[0]) <= first]
         temporary = self.path.with_name(".metrics.csv.tmp")
         temporary.write_text("\n".join(kept) + "\n", encoding="utf-8")
-        os.replace(temporary, self.path)
+        temporary.replace(self.path)
 
     def _write_events(self, row: np.ndarray) -> None:
         names = self._names or []

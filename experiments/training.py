@@ -8,7 +8,7 @@ import numpy as np
 
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
-from experiments import run_folder, summary
+from experiments import devices, run_folder, summary
 from experiments.progress import Display
 
 if TYPE_CHECKING:
@@ -67,11 +67,11 @@ def execute(plan: Plan) -> Outcome:
             f"{plan.config.method} on {plan.task}: {plan.num_seeds} seed(s), {plan.config.env_steps:,} steps each, "
             f"into {plan.folder}; compiling ..."
         )
+        devices.spread_seeds(plan.num_seeds)
         import envs  # with JAX behind it: not before the input has been checked
 
         env = envs.make(plan.task, physics=plan.physics, **plan.env_options)
-        if not plan.resume:
-            run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
+        run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
         result, rate = _train(plan, env, display)
         display.message(f"evaluating {plan.eval_episodes} episodes per seed ...")
         from ccil_jax import evaluation

@@ -1,17 +1,20 @@
-"""Toy environments with known answers, and the tiny training programs that several test modules share.
+"""Toy environments with known answers, and the tiny problems that several test modules share.
 
 They implement the contract of `envs.base` in plain JAX, so a whole training program compiles in seconds.
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.stats
 
-from ccil_jax import Config, Demonstrations, Result, train
+from ccil_jax import networks
+from ccil_jax.config import Config
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.types import Batch, PyTree
 from envs.base import State
 
 
@@ -154,3 +157,109 @@ class Conflict(Probe):
     def advance(self, physics: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         a = action[0]
         return physics, -((a - 2.0) ** 2) / 2, a**2 / 2, jnp.ones((), bool)
+
+
+def walk_demonstrations() -> Demonstrations:
+    """40 made-up steps of `Walk` in episodes of unequal lengths and costs; J_E = (3 + 1.5 + 2.25) / 3."""
+    rng = np.random.default_rng(0)
+    ends = np.array([10, 25, 40])
+    last = np.isin(np.arange(40), ends - 1)
+    costs = np.zeros(40, np.float32)
+    costs[[2, 5, 12, 30, 39]] = [2.0, 1.0, 1.5, 0.25, 2.0]
+    return Demonstrations(
+        obs=rng.normal(size=(40, 2)).astype(np.float32),
+        actions=rng.uniform(-1, 1, (40, 1)).astype(np.float32),
+        rewards=None,
+        costs=costs,
+        terminated=np.zeros(40, bool),
+        truncated=last,
+        episode_ends=ends,
+    )
+
+
+WALK_DEMONSTRATIONS_COST = 2.25  # J_E of the above
+
+
+def walk_config(**changes: Any) -> Config:
+    """A training program on `Walk` that is as small as it can be: 20 iterations, 10 a chunk."""
+    config = Config(
+        env_steps=20 * 2 * 32,
+        num_envs=4,
+        batch_size=32,
+        generator_steps=2,
+        hidden_sizes=(4,),
+        critic_minibatch_size=8,
+        critic_epochs=2,
+        fisher_stride=2,
+        max_kl=0.02,
+        critic_learning_rate=0.01,
+        discriminator_learning_rate=0.01,
+    )
+    return config.replace(**changes)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PolicyProblem:
+    """A random Gaussian policy with a random batch: what one policy step sees."""
+
+    config: Config
+    policy: networks.Policy
+    params: PyTree
+    training: Batch  # [M]
+    held_out: Batch  # [V]
+
+
+def policy_problem(seed: int, dtype: Any = np.float32, **changes: Any) -> PolicyProblem:
+    """Draws one with NumPy. Advantages depend on the actions, so that there is something to learn, and are noisy."""
+    config = Config(method="malm", hidden_sizes=(4,), cg_iterations=4, fisher_stride=2, max_kl=0.02).replace(**changes)
+    rng = np.random.default_rng(seed)
+    obs_dim, action_dim, size, num_held_out = 3, 2, 80, 30
+    policy = networks.make_policy(config, obs_dim, action_dim)
+    shapes = jax.eval_shape(policy.init, jax.random.key(0))
+    params = jax.tree.map(lambda x: jnp.asarray(rng.normal(0, 0.5, x.shape), dtype), shapes)
+    obs = rng.normal(size=(size, obs_dim))
+    mean, log_std = numpy_policy(params, obs)
+    action = mean + np.exp(log_std) * rng.normal(size=mean.shape)
+    reward_advantage = np.sin(action[:, 0] + obs[:, 0]) + 0.3 * rng.normal(size=size)
+    reward_advantage = (reward_advantage - reward_advantage.mean()) / reward_advantage.std()
+    cost_advantage = np.tanh(action[:, 1] - obs[:, 1]) + 0.5 * action[:, 0] + 0.3 * rng.normal(size=size)
+    cost = rng.uniform(size=size) * (rng.uniform(size=size) < 0.7)
+    columns = (obs, action, reward_advantage, cost_advantage, rng.normal(size=(size, 2)), cost)
+    names = ("obs", "action", "reward_advantage", "cost_advantage", "returns", "cost")
+    batch = {name: jnp.asarray(column, dtype) for name, column in zip(names, columns, strict=True)}
+    return PolicyProblem(
+        config=config,
+        policy=policy,
+        params=params,
+        training=Batch(**{name: column[num_held_out:] for name, column in batch.items()}),
+        held_out=Batch(**{name: column[:num_held_out] for name, column in batch.items()}),
+    )
+
+
+def numpy_policy(params: PyTree, obs: Any) -> tuple[np.ndarray, np.ndarray]:
+    """(mean, log-std) of the tanh policy in NumPy, float64."""
+    layers = params["mean"]["params"]
+    x = np.asarray(obs, np.float64)
+    for i in range(len(layers)):
+        layer = layers[f"Dense_{i}"]
+        x = (np.tanh(x) if i else x) @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+    return x, np.asarray(params["log_std"], np.float64)
+
+
+def numpy_log_prob(params: PyTree, batch: Batch) -> np.ndarray:
+    """Log densities of the batch's actions under the tanh policy, [M], by SciPy."""
+    mean, log_std = numpy_policy(params, batch.obs)
+    return np.sum(scipy.stats.norm.logpdf(np.asarray(batch.action, np.float64), mean, np.exp(log_std)), axis=-1)
+
+
+def same_bits(a: PyTree, b: PyTree) -> bool:
+    """Whether two pytrees have the same structure and the same bits in every leaf."""
+
+    def data(x: Any) -> np.ndarray:
+        is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return np.asarray(jax.random.key_data(x) if is_key else x)
+
+    if jax.tree.structure(a) != jax.tree.structure(b):
+        return False
+    leaves = [(data(x), data(y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)]
+    return all(x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in leaves)

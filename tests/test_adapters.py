@@ -53,12 +53,15 @@ def test_vector_env_resets_in_the_step_that_ends_an_episode(vector_env: Gymnasiu
     vector_env.action_space.seed(0)
     for t in range(2 * NUM_STEPS):
         obs, reward, terminated, truncated, info = vector_env.step(vector_env.action_space.sample())
-        assert vector_env.observation_space.contains(obs) and reward.shape == (NUM_ENVS,)
-        assert set(np.unique(info["cost"])) <= {0.0, 1.0} and not terminated.any()
+        assert vector_env.observation_space.contains(obs)
+        assert reward.shape == (NUM_ENVS,)
+        assert set(np.unique(info["cost"])) <= {0.0, 1.0}
+        assert not terminated.any()
         ended = (t + 1) % NUM_STEPS == 0
         assert truncated.all() == truncated.any() == ended == ("final_obs" in info)
         if ended:
-            assert info["_final_obs"].all() and np.abs(info["final_obs"][0] - obs[0]).max() > 0.1
+            assert info["_final_obs"].all()
+            assert np.abs(info["final_obs"][0] - obs[0]).max() > 0.1
             assert np.abs(obs[:, :8]).max() <= 0.1001, "positions of a fresh episode"
             assert (info["final_info"]["episode_cost"] >= info["final_info"]["cost"]).all()
     again, _ = vector_env.reset(seed=0)
@@ -110,7 +113,8 @@ def test_from_brax_keeps_the_contract() -> None:
     state = env.reset(jax.random.key(0))
     for expected in (False, True):
         state = env.step(state, jnp.full(env.action_dim, 3.0))
-        assert bool(state.truncated) == expected and state.cost == env.action_dim
+        assert bool(state.truncated) == expected
+        assert state.cost == env.action_dim
     assert state.episode_cost == 2 * env.action_dim
 
 

@@ -35,7 +35,8 @@ def test_sizes_are_the_registrys(env: Any) -> None:
     info = envs.TASKS[env.name]
     assert (env.obs_dim, env.action_dim) == (info.obs_dim, info.action_dim) == (env.obs_dim, env.model.nu)
     assert env.action_low.shape == env.action_high.shape == (env.action_dim,)
-    assert env.physics_name == "native" and env.max_episode_steps == 1000
+    assert env.physics_name == "native"
+    assert env.max_episode_steps == 1000
 
 
 def test_reset_noise(env: Any) -> None:
@@ -53,7 +54,7 @@ def test_reset_noise(env: Any) -> None:
 
 
 def test_time_limit_truncates() -> None:
-    env = envs.make("HalfCheetah", physics="native", max_episode_steps=3)
+    env: Any = envs.make("HalfCheetah", physics="native", max_episode_steps=3)
     state, step = env.reset(jax.random.key(0)), jax.jit(env.step)
     flags = []
     for _ in range(3):
@@ -74,17 +75,20 @@ def test_time_limit_truncates() -> None:
     ],
 )
 def test_unhealthy_terminates_and_pays_no_healthy_reward(name: str, index: int, value: float) -> None:
-    env = envs.make(name, physics="native")
+    env: Any = envs.make(name, physics="native")
     qpos, qvel = np.array(env.model.qpos0, np.float32), np.zeros(env.model.nv, np.float32)
     healthy = env.step(env.reset_to(qpos, qvel), jnp.zeros(env.action_dim))
     qpos[index] = value
     fallen = env.step(env.reset_to(qpos, qvel), jnp.zeros(env.action_dim))
-    assert not healthy.terminated and healthy.terms["healthy"] > 0
-    assert fallen.terminated and not fallen.truncated and fallen.terms["healthy"] == 0
+    assert not healthy.terminated
+    assert healthy.terms["healthy"] > 0
+    assert fallen.terminated
+    assert not fallen.truncated
+    assert fallen.terms["healthy"] == 0
 
 
 def test_hopper_terminates_on_any_large_coordinate() -> None:
-    env = envs.make("Hopper", physics="native")
+    env: Any = envs.make("Hopper", physics="native")
     qvel = np.zeros(6, np.float32)
     qvel[0] = 101.0  # forward speed: beyond the healthy state range, though height and pitch are fine
     state = env.step(env.reset_to(np.array(env.model.qpos0), qvel), jnp.zeros(3))
@@ -95,10 +99,10 @@ def test_hopper_terminates_on_any_large_coordinate() -> None:
 def test_cost_threshold_is_strict_and_configurable() -> None:
     action = jnp.full(6, 0.5)  # 0.1 * sum of squares = 0.15
     for threshold, cost in [(0.1, 1.0), (0.2, 0.0)]:
-        env = envs.make("HalfCheetah", physics="native", cost_threshold=threshold)
+        env: Any = envs.make("HalfCheetah", physics="native", cost_threshold=threshold)
         assert env.step(env.reset(jax.random.key(0)), action).cost == cost
-    env = envs.make("Hopper", physics="native", cost_threshold=3.0)
-    assert env.step(env.reset(jax.random.key(0)), jnp.ones(3)).cost == 0.0  # 3 > 3 is false
+    hopper: Any = envs.make("Hopper", physics="native", cost_threshold=3.0)
+    assert hopper.step(hopper.reset(jax.random.key(0)), jnp.ones(3)).cost == 0.0  # 3 > 3 is false
 
 
 @pytest.mark.parametrize("name", ["Ant", "Humanoid"])
@@ -107,15 +111,17 @@ def test_contact_cost_can_be_dropped(name: str) -> None:
     keys = jax.random.split(jax.random.key(0), 4)
     results = {}
     for contact_cost in (True, False):
-        env = envs.make(name, physics="native", contact_cost=contact_cost, cost_threshold=0.0)
+        env: Any = envs.make(name, physics="native", contact_cost=contact_cost, cost_threshold=0.0)
 
         def rollout(key: jax.Array, env: Any = env) -> State:
             state = env.reset(key)
-            return jax.lax.scan(lambda s, a: (env.step(s, a),) * 2, state, jnp.zeros((60, env.action_dim)))[1]
+            states: State = jax.lax.scan(lambda s, a: (env.step(s, a),) * 2, state, jnp.zeros((60, env.action_dim)))[1]
+            return states
 
         results[contact_cost] = jax.jit(jax.vmap(rollout))(keys)
     np.testing.assert_array_equal(results[True].obs, results[False].obs)
-    assert not results[False].cost.any() and not results[False].terms["contact"].any()
+    assert not results[False].cost.any()
+    assert not results[False].terms["contact"].any()
     np.testing.assert_array_equal(results[True].cost, results[True].terms["contact"] < 0)
     assert results[True].cost.any()
 
@@ -125,25 +131,32 @@ def test_terms_sum_to_the_reward(env: Any) -> None:
         jax.random.split(jax.random.key(3), NUM_ENVS)
     )
     kept = env.task.reward_terms
-    assert ("control" in kept) == (env.name in ("Swimmer", "Walker2d")) and "contact" not in kept
+    assert ("control" in kept) == (env.name in ("Swimmer", "Walker2d"))
+    assert "contact" not in kept
     np.testing.assert_allclose(state.reward, sum(state.terms[name] for name in kept), rtol=1e-6)
     assert (state.terms["control"] < 0).all()
 
 
 def test_non_finite_physics_terminates_with_finite_values(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning to a log file in the working directory
-    env = envs.make("HalfCheetah", physics="native")
+    env: Any = envs.make("HalfCheetah", physics="native")
     state = env.step(env.reset_to(jnp.zeros(9), jnp.full(9, 1e20)), jnp.zeros(6))
-    assert state.terminated and state.reward == 0.0 and state.cost == 0.0
-    assert np.isfinite(state.obs).all() and np.isfinite(list(state.terms.values())).all()
+    assert state.terminated
+    assert state.reward == 0.0
+    assert state.cost == 0.0
+    assert np.isfinite(state.obs).all()
+    assert np.isfinite(list(state.terms.values())).all()
     nan_action = env.step(env.reset(jax.random.key(0)), jnp.full(6, jnp.nan))
-    assert nan_action.terminated and np.isfinite(nan_action.obs).all() and np.isfinite(nan_action.reward)
+    assert nan_action.terminated
+    assert np.isfinite(nan_action.obs).all()
+    assert np.isfinite(nan_action.reward)
 
 
 def test_auto_physics_is_native_on_the_cpu() -> None:
     if jax.default_backend() != "cpu":
         pytest.skip("not on a CPU")
-    assert envs.make("Swimmer").physics_name == "native"
+    env: Any = envs.make("Swimmer")
+    assert env.physics_name == "native"
 
 
 def test_wrong_names_are_refused_in_one_line() -> None:

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -186,9 +187,11 @@ def test_divergence_gives_nan_and_spares_the_neighbours(
     after = jax.vmap(physics.step)(jax.vmap(physics.init)(qpos, wrong), ctrl)
     again = jax.vmap(physics.step)(after, ctrl)
     others = np.array([0, 2])
-    assert np.isnan(after.qpos[1]).all() and np.isnan(after.qvel[1]).all()
+    assert np.isnan(after.qpos[1]).all()
+    assert np.isnan(after.qvel[1]).all()
     np.testing.assert_array_equal(after.qpos[others], good.qpos[others])
-    assert np.isnan(again.qpos[1]).all() and np.isfinite(again.qpos[others]).all()
+    assert np.isnan(again.qpos[1]).all()
+    assert np.isfinite(again.qpos[others]).all()
 
 
 def test_mjx_equals_c_on_a_pendulum_and_scans() -> None:
@@ -198,7 +201,7 @@ def test_mjx_equals_c_on_a_pendulum_and_scans() -> None:
     for name in ("native", "mjx"):
         physics = make_physics(name, model, num_substeps=3, fields=["xpos"], track=["qpos", "xipos"])
 
-        def run(qpos: jax.Array, ctrl: jax.Array, physics: object = physics) -> object:
+        def run(qpos: jax.Array, ctrl: jax.Array, physics: Any = physics) -> object:
             data = physics.init(qpos, jnp.zeros(1))
             return jax.lax.scan(lambda data, u: (physics.step(data, u),) * 2, data, ctrl)[1]
 
@@ -216,7 +219,8 @@ def test_mjx_step_is_differentiable() -> None:
         return physics.step(physics.init(jnp.array([0.3]), jnp.zeros(1)), ctrl).qvel.sum()
 
     gradient = jax.jacfwd(height)(jnp.zeros(1))
-    assert np.isfinite(gradient).all() and gradient[0] != 0.0
+    assert np.isfinite(gradient).all()
+    assert gradient[0] != 0.0
 
 
 def test_mjx_table_has_the_routine_that_the_correction_replaces() -> None:

@@ -4,6 +4,7 @@ from typing import Any, Protocol
 
 import jax
 from flax import struct
+from jax.typing import ArrayLike
 
 PyTree = Any
 
@@ -28,10 +29,11 @@ class Physics(Protocol):
     """Pure functions of one simulation; callers vmap them. Same values in, same values out."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """The backend's name, as in `make_physics`."""
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> Data:
+    def init(self, qpos: ArrayLike, qvel: ArrayLike) -> Data:
         """A simulation at rest in time at `qpos` `[nq]`, `qvel` `[nv]`, without a warm start."""
 
-    def step(self, data: Data, ctrl: jax.Array) -> Data:
+    def step(self, data: Data, ctrl: ArrayLike) -> Data:
         """Advances one control step (all its substeps) under constant `ctrl` `[nu]`."""

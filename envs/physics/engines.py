@@ -22,16 +22,21 @@ class Engine(Protocol):
     status: np.ndarray  # [num_sims] int, nonzero where the last call raised
     warning: np.ndarray  # [num_sims, number of kinds, 2] int: last info, count
 
-    def bind(self, name: str) -> np.ndarray: ...
-    def step(self, *, nstep: int) -> None: ...
-    def forward(self) -> None: ...
+    def bind(self, name: str) -> np.ndarray:
+        """`[num_sims, ...]`, refreshed by each call."""
+
+    def step(self, *, nstep: int) -> None:
+        """`nstep` engine steps under constant controls."""
+
+    def forward(self) -> None:
+        """The forward pass: derived arrays at the present state."""
 
 
 def make_engine(model: mujoco.MjModel, num_sims: int, num_threads: int, derived: Sequence[str]) -> Engine:
     """An engine whose `bind` knows the `derived` arrays. Steps raise `SimulationError` where MuJoCo raises."""
     if POST_CONSTRAINT.intersection(derived):
         return PostConstraintEngine(model, num_sims, num_threads, derived)
-    engine = Batch(model, num_sims, num_threads)
+    engine: Engine = Batch(model, num_sims, num_threads)
     for name in derived:
         engine.bind(name)  # before the first call: a derived array is filled only by later calls
     return engine

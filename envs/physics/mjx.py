@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 from flax import struct
+from jax.typing import ArrayLike
 
 from envs.physics.base import Data
 from envs.physics.mjx_patch import align_plane_capsule_frames
@@ -80,7 +81,7 @@ class MjxPhysics:
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in ("qpos", "qvel")))
         self._forces = "cfrc_ext" in fields
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> Data:
+    def init(self, qpos: ArrayLike, qvel: ArrayLike) -> Data:
         """See `Physics.init`."""
         template = self._template
         data = template.replace(
@@ -90,7 +91,7 @@ class MjxPhysics:
             data = self._mjx.forward(self._model, data)
         return self._pack(data, {n: jnp.zeros_like(read(data, n)) for n in self._track})
 
-    def step(self, data: Data, ctrl: jax.Array) -> Data:
+    def step(self, data: Data, ctrl: ArrayLike) -> Data:
         """See `Physics.step`."""
         carry = data.backend
         before = carry.tracked | {"qpos": carry.qpos, "qvel": carry.qvel}
@@ -125,7 +126,8 @@ class MjxPhysics:
 def read(data: Any, name: str) -> jax.Array:
     """An array of `mjx.Data`, from its public part or from its implementation's (where cinert, cfrc_ext are)."""
     public = any(field.name == name for field in type(data).fields())
-    return getattr(data if public else data._impl, name)
+    array: jax.Array = getattr(data if public else data._impl, name)
+    return array
 
 
 def import_mjx() -> Any:

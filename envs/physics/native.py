@@ -4,22 +4,24 @@ The engine's float64 state travels through JAX as its bits (`bits.py`), so nothi
 hides in the engine: a step is a function of its arguments alone, and replays of a recorded run are exact.
 """
 
+import contextlib
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.typing import ArrayLike
 from mujoco.batch import SimulationError
 
 from envs.physics.base import Data
 from envs.physics.bits import float64_bits
 from envs.physics.engines import Engine, make_engine
 
-_STATE_SPEC = {"qpos": mujoco.mjtState.mjSTATE_QPOS, "qvel": mujoco.mjtState.mjSTATE_QVEL}
+_STATE_NAMES = frozenset({"qpos", "qvel"})
 _DIVERGED = [
     int(warning)
     for warning in (
@@ -64,9 +66,9 @@ class NativePhysics:
         self._num_substeps = num_substeps
         self._num_threads = num_threads or usable_cpus()
         self._lock = threading.Lock()
-        self._engines: dict[int, Engine] = {}
+        self._idle_engines: dict[int, list[Engine]] = {}  # by number of simulations; a call holds one for itself
         self._fields, self._track = tuple(fields), tuple(track)
-        self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in _STATE_SPEC))
+        self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in _STATE_NAMES))
         template = mujoco.MjData(model)
         self._shapes = {n: np.shape(getattr(template, n)) for n in ("qpos", "qvel", *self._derived)}
         # The state's components up to the warm start, and the controls right behind them: all that the next step
@@ -76,14 +78,14 @@ class NativePhysics:
             int(mujoco.mjtState.mjSTATE_PHYSICS | mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_WARMSTART),
         )
         self._state_columns = {"qpos": slice(1, 1 + model.nq), "qvel": slice(1 + model.nq, 1 + model.nq + model.nv)}
-        tracked = [n for n in self._track if n not in _STATE_SPEC]
+        tracked = [n for n in self._track if n not in _STATE_NAMES]
         self._tracked_columns, self._row_size = _columns(tracked, self._shapes, self._num_state)
         self._outputs, self._output_size = _columns(
             ["qpos", "qvel", *self._fields, *(f"change/{n}" for n in self._track)],
             self._shapes | {f"change/{n}": self._shapes[n] for n in self._track},
         )
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> Data:
+    def init(self, qpos: ArrayLike, qvel: ArrayLike) -> Data:
         """See `Physics.init`. Without derived arrays the engine is not called: auto-reset runs this at each step."""
         dtype = jnp.result_type(float)
         qpos, qvel = jnp.asarray(qpos, dtype), jnp.asarray(qvel, dtype)
@@ -94,19 +96,20 @@ class NativePhysics:
         change = {n: jnp.zeros(self._shapes[n], dtype) for n in self._track}
         return Data(qpos=qpos, qvel=qvel, fields={}, change=change, backend=bits)
 
-    def step(self, data: Data, ctrl: jax.Array) -> Data:
+    def step(self, data: Data, ctrl: ArrayLike) -> Data:
         """See `Physics.step`."""
-        return self._call(self._advance, data.backend, ctrl)
+        return self._call(self._advance, data.backend, jnp.asarray(ctrl))
 
     def _call(self, function: Callable[..., None], bits: jax.Array, ctrl: jax.Array) -> Data:
         shapes = (
-            jax.ShapeDtypeStruct((2 * self._row_size,), jnp.uint32),
-            jax.ShapeDtypeStruct((self._output_size,), jnp.result_type(float)),
+            jax.ShapeDtypeStruct((2 * self._row_size,), jnp.uint32),  # type: ignore[no-untyped-call]
+            jax.ShapeDtypeStruct((self._output_size,), jnp.result_type(float)),  # type: ignore[no-untyped-call]
         )
         bits, values = host_call(function, shapes, bits, ctrl)
 
         def output(name: str, like: str) -> jax.Array:
-            return values[self._outputs[name]].reshape(self._shapes[like])
+            flat: jax.Array = values[self._outputs[name]]
+            return flat.reshape(self._shapes[like])
 
         return Data(
             qpos=output("qpos", "qpos"),
@@ -116,11 +119,19 @@ class NativePhysics:
             backend=bits,
         )
 
-    def _engine(self, num_sims: int) -> Engine:
-        if num_sims not in self._engines:
-            threads = min(self._num_threads, num_sims)
-            self._engines[num_sims] = make_engine(self._model, num_sims, threads, self._derived)
-        return self._engines[num_sims]
+    @contextlib.contextmanager
+    def _engine(self, num_sims: int) -> Iterator[Engine]:
+        """An engine of that size that no other device's program is using."""
+        with self._lock:
+            idle = self._idle_engines.setdefault(num_sims, [])
+            engine = idle.pop() if idle else None
+        if engine is None:
+            engine = make_engine(self._model, num_sims, min(self._num_threads, num_sims), self._derived)
+        try:
+            yield engine
+        finally:
+            with self._lock:
+                idle.append(engine)
 
     # What follows runs on the host, inside a running JAX program: NumPy only, a JAX call could deadlock.
 
@@ -141,8 +152,7 @@ class NativePhysics:
     ) -> None:
         old, new = bits.view(np.float64), bits_out.view(np.float64)
         end = self._num_state
-        with self._lock:
-            engine = self._engine(len(bits))
+        with self._engine(len(bits)) as engine:
             engine.state[:, :end] = old[:, :end]
             engine.state[:, end : end + ctrl.shape[1]] = ctrl
             failed = _guarded(engine, call)
@@ -173,8 +183,8 @@ def host_call(function: Callable[..., None], shapes: Any, *args: jax.Array) -> A
     """
 
     def rows(array: Any) -> np.ndarray:
-        array = np.asarray(array)
-        return array.reshape(-1, array.shape[-1])
+        flat: np.ndarray = np.asarray(array)
+        return flat.reshape(-1, flat.shape[-1])
 
     def in_place(_: Any, outputs: Any, *inputs: Any) -> None:
         function(*map(rows, inputs), *map(rows, outputs))
@@ -200,7 +210,7 @@ def _guarded(engine: Engine, call: Callable[[Engine], None]) -> np.ndarray | Non
     except SimulationError:
         failed = engine.status != 0
     if engine.warning.any():  # rare, and cheaper to ask than to select the kinds each time
-        diverged = engine.warning[:, _DIVERGED, 1].any(axis=1)
+        diverged = np.asarray(engine.warning[:, _DIVERGED, 1].any(axis=1))
         failed = diverged if failed is None else failed | diverged
         engine.warning[...] = 0
     return failed if failed is not None and failed.any() else None

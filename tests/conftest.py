@@ -1,0 +1,69 @@
+"""What all tests share: the CPU, reproducible examples, and signatures that are checked while the tests run."""
+
+import functools
+import importlib.abc
+import importlib.machinery
+import inspect
+import os
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # read when JAX is imported, here and in the tests' subprocesses
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import beartype
+import jaxtyping
+from hypothesis import settings
+
+# The first call of a jitted function compiles, so no example has a deadline. The same examples on every run.
+settings.register_profile("tests", deadline=None, derandomize=True)
+settings.load_profile("tests")
+
+CHECKED = (  # modules of functions on arrays; shapes must agree across the arguments and the result of each call
+    "ccil_jax.constraints",
+    "ccil_jax.distributions",
+    "ccil_jax.regression",
+    "ccil_jax.returns",
+    "ccil_jax.running_statistics",
+    "ccil_jax.trust_region",
+)
+# An int passes for a float, as it does for mypy.
+TYPECHECKER = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))
+
+
+def check_signatures(module: ModuleType) -> None:
+    """Wraps the functions that `module` defines so that every call is checked against its annotations.
+
+    jaxtyping's own import hook would check classes too, and tree transformations rebuild containers with leaves that
+    are no arrays (`flax.struct` fields): here classes are left alone.
+    """
+    for name, value in vars(module).copy().items():
+        if inspect.isfunction(value) and value.__module__ == module.__name__:
+            setattr(module, name, jaxtyping.jaxtyped(typechecker=TYPECHECKER)(value))
+
+
+class CheckingFinder(importlib.abc.MetaPathFinder):
+    """Checks the modules in `CHECKED` from the moment of their import, before anyone can take a name from them."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if name not in CHECKED:
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        if spec is None or spec.loader is None:
+            return None
+        execute = spec.loader.exec_module
+
+        @functools.wraps(execute)
+        def execute_and_check(module: ModuleType) -> None:
+            execute(module)
+            check_signatures(module)
+
+        spec.loader.exec_module = execute_and_check  # type: ignore[method-assign]
+        return spec
+
+
+assert not set(CHECKED) & set(sys.modules), "imported too early to be checked"
+sys.meta_path.insert(0, CheckingFinder())

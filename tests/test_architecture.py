@@ -1,0 +1,224 @@
+"""Rules that a reader of one file cannot see: who may import whom, what importing costs, what is never called."""
+
+import ast
+import importlib.metadata
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGES = ("ccil_jax", "envs", "experiments")
+SOURCES = {  # module name -> file
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOURCES.items()}
+
+# A file of the learner imports only from those before it. A new file needs a place here.
+ORDER = (
+    "npz",
+    "config",
+    "types",
+    "distributions",
+    "networks",
+    "running_statistics",
+    "returns",
+    "demonstrations",
+    "rollout",
+    "trust_region",
+    "regression",
+    "reward_models",
+    "constraints",
+    "methods",
+    "policy_step",
+    "on_policy",
+    "evaluation",
+    "checkpointing",
+    "runner",
+)
+# The step takes gradients and weights, whatever they stand for; the constraints get the inner step as a function.
+STRANGERS = {
+    "trust_region": {"config", "demonstrations", "networks", "reward_models", "rollout"},
+    "constraints": {"trust_region", "rollout", "reward_models", "networks"},
+}
+FORBIDDEN_CALLS = {  # each runs code that it finds in data
+    "eval", "exec", "compile", "yaml.load", "yaml.unsafe_load", "yaml.full_load", "marshal.load", "marshal.loads",
+    "shelve.open", "pandas.read_pickle", "torch.load",
+}  # fmt: skip
+FORBIDDEN_MODULES = {"pickle", "cloudpickle", "dill", "joblib", "jsonpickle", "marshal", "shelve"}
+DEVICE_WORK = (
+    "jax.numpy.",
+    "jax.random.",
+    "jax.lax.",
+    "jax.nn.",
+    "jax.device",
+    "jax.local_device",
+    "jax.default_backend",
+)
+
+
+def imports(tree: ast.AST) -> Iterator[str]:
+    """Names of the modules and members that a file imports, wherever it does so."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"relative import in line {node.lineno}"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def module_of(name: str) -> str:
+    """The source module in which an imported name lives; the name itself if it is not one of ours."""
+    while name not in SOURCES and "." in name:
+        name = name.rpartition(".")[0]
+    return name
+
+
+def own_imports(name: str) -> set[str]:
+    found = {module_of(imported) for imported in imports(TREES[name])}
+    return {module for module in found if module.partition(".")[0] in (*PACKAGES, "tests")}
+
+
+def calls(tree: ast.AST) -> Iterator[tuple[str, ast.Call]]:
+    """Every call of a plain dotted name, with aliases of imports resolved."""
+    aliases: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            aliases |= {alias.asname: alias.name for alias in node.names if alias.asname}
+        elif isinstance(node, ast.ImportFrom):
+            aliases |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            root, dot, rest = ast.unparse(node.func).partition(".")
+            yield aliases.get(root, root) + dot + rest, node
+
+
+def test_the_sources_are_found() -> None:
+    assert {"ccil_jax", "ccil_jax.runner", "envs.base", "envs.registry", "experiments.train"} <= SOURCES.keys()
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_packages_import_only_downwards(name: str) -> None:
+    package = name.partition(".")[0]
+    allowed = {
+        "envs": lambda module: module.startswith("envs"),
+        "ccil_jax": lambda module: module.startswith("ccil_jax") or module == "envs.base",
+        "experiments": lambda module: not module.startswith("tests"),
+    }[package]
+    assert [module for module in own_imports(name) if not allowed(module)] == []
+
+
+@pytest.mark.parametrize("name", [name for name in SOURCES if name.startswith("ccil_jax.")])
+def test_the_learner_imports_only_from_files_before(name: str) -> None:
+    file = name.removeprefix("ccil_jax.")
+    assert file in ORDER, f"give {file} a place in ORDER"
+    imported = {m.removeprefix("ccil_jax.") for m in own_imports(name) if m.startswith("ccil_jax")}
+    assert imported <= set(ORDER[: ORDER.index(file)])
+    assert not imported & STRANGERS.get(file, set())
+
+
+def test_the_order_names_existing_files() -> None:
+    assert sorted(f"ccil_jax.{file}" for file in ORDER) == sorted(n for n in SOURCES if n.startswith("ccil_jax."))
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_file_can_make_us_run_its_code(name: str) -> None:
+    assert [m for m in imports(TREES[name]) if m.partition(".")[0] in FORBIDDEN_MODULES] == []
+    for function, call in calls(TREES[name]):
+        where = f"{name}, line {call.lineno}: {function}"
+        assert function not in FORBIDDEN_CALLS, where
+        for keyword in call.keywords:
+            if keyword.arg == "allow_pickle":
+                assert isinstance(keyword.value, ast.Constant), where
+                assert keyword.value.value is False, where
+
+
+def at_import(tree: ast.Module) -> Iterator[ast.AST]:
+    """The parts of a module that run when it is imported: all but the bodies of its functions."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            waiting += [*node.decorator_list, *node.args.defaults, *filter(None, node.args.kw_defaults)]
+        elif isinstance(node, ast.Lambda):
+            waiting += [*node.args.defaults, *filter(None, node.args.kw_defaults)]
+        else:
+            yield node
+            waiting += ast.iter_child_nodes(node)
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_importing_does_no_work_on_a_device(name: str) -> None:
+    tree = TREES[name]
+    run = {id(node) for node in at_import(tree)}
+    found = [(f, call.lineno) for f, call in calls(tree) if id(call) in run and f.startswith(DEVICE_WORK)]
+    assert found == []
+
+
+def python(code: str, **environment: str) -> str:
+    """Runs code in a fresh interpreter; returns what it prints."""
+    command, settings = [sys.executable, "-c", code], {**os.environ, **environment}
+    result = subprocess.run(command, cwd=ROOT, env=settings, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.mark.parametrize("name", ["ccil_jax", "envs", "experiments", "ccil_jax.config", "envs.registry"])
+def test_importing_imports_no_heavy_package(name: str) -> None:
+    heavy = ("jax", "jaxlib", "flax", "optax", "orbax", "brax", "mujoco", "matplotlib", "gymnasium")
+    assert python(f"import sys, {name}; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"
+
+
+def test_everything_can_be_imported_where_jax_has_no_device() -> None:
+    python(
+        "import importlib, ccil_jax, envs\n"
+        f"for name in {list(SOURCES)}: importlib.import_module(name)\n"
+        "for package in (ccil_jax, envs):\n"
+        "    for name in package.__all__: getattr(package, name)",
+        JAX_PLATFORMS="no_such_platform",
+    )
+
+
+@pytest.mark.parametrize("name", [name for name in SOURCES if not name.startswith("experiments")])
+def test_public_names_have_docstrings(name: str) -> None:
+    assert ast.get_docstring(TREES[name]), "the module itself"
+    missing = [node.name for node in public(TREES[name]) if not ast.get_docstring(node)]
+    assert missing == []
+
+
+def public(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.ClassDef]:
+    """Public functions, classes and methods, except those of protocols: their class speaks for them."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            yield node
+            is_protocol = isinstance(node, ast.ClassDef) and "Protocol" in map(ast.unparse, node.bases)
+            if isinstance(node, ast.ClassDef) and not is_protocol:
+                methods = (member for member in node.body if isinstance(member, ast.FunctionDef))
+                yield from (method for method in methods if not method.name.startswith("_"))
+
+
+def test_no_file_names_a_folder_of_one_machine() -> None:
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listing.returncode:
+        pytest.skip("not a git checkout")
+    pattern = re.compile(r"(?<![\w./~-])/(?:home|root|Users|work|tmp|opt|mnt|scratch)/\w|[A-Z]:\\\\")
+    for file in filter(None, listing.stdout.split("\0")):
+        path = ROOT / file
+        content = path.read_bytes() if path.is_file() else b""
+        if b"\0" not in content:
+            lines = content.decode().splitlines()
+            assert [(file, number) for number, line in enumerate(lines, 1) if pattern.search(line)] == []
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    import ccil_jax
+
+    if "ccil_jax" not in {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}:
+        pytest.skip("not installed")
+    assert ccil_jax.__version__ == importlib.metadata.version("ccil_jax")

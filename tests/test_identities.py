@@ -1,0 +1,115 @@
+"""Methods that are one another's special cases (specs/algorithms.md section 2), bit for bit on a whole training run.
+
+Every run is the production path: `runner.resolve`, then `init` and iterations of `on_policy.make`, jitted and vmapped
+over seeds.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from ccil_jax import methods, on_policy, reward_models, runner
+from ccil_jax.config import Config
+from ccil_jax.on_policy import AgentState
+from ccil_jax.types import ExpertData, Metrics
+from tests.probe_envs import WALK_DEMONSTRATIONS_COST, Walk, same_bits, walk_config, walk_demonstrations
+
+NUM_ITERATIONS = 4  # of two generator steps: the second iteration's rewards, multipliers and statistics have moved
+
+
+@functools.cache
+def program(reward: str = "row") -> Any:
+    """One jitted function for all configurations: it compiles anew for other static fields only."""
+
+    @jax.jit
+    def run(config: Config, expert: ExpertData | None, keys: jax.Array) -> tuple[AgentState, Metrics]:
+        agent = on_policy.make(config, Walk(), expert)
+
+        def train(key: jax.Array) -> tuple[AgentState, Metrics]:
+            return jax.lax.scan(lambda state, _: agent.step(state), agent.init(key), None, length=NUM_ITERATIONS)
+
+        return jax.vmap(train)(keys)
+
+    return run
+
+
+def train(config: Config, reward: str = "row") -> tuple[AgentState, Metrics]:
+    demonstrations = walk_demonstrations()
+    config = runner.resolve(config, Walk(), demonstrations)
+    expert = runner.expert_data(demonstrations)
+    return jax.tree.map(lambda x: x, program(reward)(config, expert, jax.random.split(jax.random.key(0), 2)))
+
+
+@functools.cache
+def ccil() -> tuple[AgentState, Metrics]:
+    return train(walk_config(method="ccil"))
+
+
+def frozen(**changes: Any) -> Config:
+    """A multiplier that starts at 0 and stays there."""
+    changes = {"multiplier_update": "sgd", "initial_multiplier": 0.0, "multiplier_learning_rate": 0.0} | changes
+    return walk_config(method="ccil", **changes)
+
+
+@functools.cache
+def gail() -> tuple[AgentState, Metrics]:
+    return train(walk_config(method="gail"))
+
+
+def assert_equal(
+    one: tuple[AgentState, Metrics], other: tuple[AgentState, Metrics], but: tuple[str, ...] = ()
+) -> None:
+    """Equal bits in every field of the state and every metric, `but` for the named."""
+    for name in {field for field in vars(one[0]) if field not in but}:
+        assert same_bits(getattr(one[0], name), getattr(other[0], name)), name
+    assert set(one[1]) - set(but) == set(other[1]) - set(but)
+    for name in set(one[1]) - set(but):
+        assert same_bits(one[1][name], other[1][name]), name
+
+
+def test_the_runs_are_worth_comparing() -> None:
+    """Policies move, multipliers and rewards change, episodes end, and nothing is NaN."""
+    state, metrics = jax.tree.map(np.asarray, ccil()[1:])[0], {k: np.asarray(v) for k, v in ccil()[1].items()}
+    assert all(np.isfinite(value).all() for value in metrics.values())
+    assert (metrics["step_fraction"] > 0).all()
+    assert (metrics["episodes_finished"] > 0).all()
+    assert np.ptp(metrics["multiplier"], axis=1).min() > 0
+    assert np.ptp(metrics["imitation_reward"], axis=1).min() > 0
+    assert np.abs(metrics["episode_cost"] - WALK_DEMONSTRATIONS_COST).min() > 0
+    assert state is not None
+
+
+def test_lgail_with_the_experts_cost_as_its_limit_is_ccil() -> None:
+    lgail = train(walk_config(method="lgail", cost_limit=WALK_DEMONSTRATIONS_COST))
+    assert_equal(lgail, ccil())
+
+
+def test_lgail_with_another_limit_is_not() -> None:
+    lgail = train(walk_config(method="lgail", cost_limit=WALK_DEMONSTRATIONS_COST + 1))  # the same program
+    assert not same_bits(lgail[0].actor, ccil()[0].actor)
+
+
+def test_malm_with_the_meta_step_off_and_no_held_out_split_is_ccil() -> None:
+    assert_equal(train(walk_config(method="malm", meta_gradient="none", held_out_fraction=0.0)), ccil())
+
+
+def test_ccil_with_the_multiplier_frozen_at_0_is_gail() -> None:
+    one = train(frozen())
+    assert np.all(np.asarray(one[1]["multiplier"]) == 0)
+    assert_equal(one, gail(), but=("constraint",))
+
+
+def test_ccil_with_a_multiplier_that_moves_is_not_gail() -> None:
+    one = train(frozen(initial_multiplier=0.5, multiplier_learning_rate=0.1))  # the same program
+    assert not same_bits(one[0].actor, gail()[0].actor)
+
+
+def test_gail_with_the_tasks_reward_in_the_discriminators_place_is_trpo(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert methods.METHODS["gail"].reward == "discriminator"
+    trpo = train(walk_config(method="trpo", cost_limit=WALK_DEMONSTRATIONS_COST))
+    monkeypatch.setattr(reward_models, "discriminator", lambda *_: reward_models.task())
+    assert_equal(train(walk_config(method="gail"), reward="task"), trpo)
+    assert not same_bits(gail()[0].actor, trpo[0].actor)

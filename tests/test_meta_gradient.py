@@ -1,0 +1,309 @@
+"""MALM's outer step: the derivative of the inner policy step, and of the held-out loss through it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from ccil_jax import constraints, policy_step, trust_region
+from ccil_jax.config import Config
+from ccil_jax.constraints import Multiplier, Outer
+from ccil_jax.policy_step import PolicyStep
+from ccil_jax.trust_region import Directions
+from ccil_jax.types import Batch, PyTree
+from tests.probe_envs import PolicyProblem, numpy_log_prob, policy_problem, same_bits
+
+KINDS = ("full", "direct", "indirect")
+STEP = 1e-5  # of the central differences: their error is about STEP^2 + 1e-16 / STEP
+
+
+class Learner:
+    """The inner step and the outer gradient of random problems, each compiled once. Use within float64."""
+
+    def __init__(self, **changes: Any) -> None:
+        template = policy_problem(0, np.float64, **changes)
+        config, apply = template.config, template.policy.apply
+        constraint = constraints.meta_lagrangian(config)
+
+        @jax.jit
+        def improve(
+            params: PyTree, training: Batch, held_out: Batch, multiplier: jax.Array, kl_tolerance: jax.Array
+        ) -> tuple[PyTree, PolicyStep]:
+            changed = config.replace(kl_tolerance=kl_tolerance)
+            gap = jnp.zeros(())
+            return policy_step.improve(changed, apply, constraint, params, training, multiplier, gap, held_out)[:2]
+
+        @jax.jit
+        def gradients(taken: PolicyStep, multiplier: jax.Array, after_dual: jax.Array) -> list[jax.Array]:
+            outer = policy_step.outer_problem(config, apply, constraint, taken)
+            return [constraints.outer_gradient(kind, multiplier, after_dual, outer) for kind in KINDS]
+
+        @jax.jit
+        def step_derivative(taken: PolicyStep, multiplier: jax.Array) -> jax.Array:
+            def replay(multiplier: jax.Array) -> jax.Array:
+                weights = constraint.combine(multiplier, taken.cost_gap, taken.directions.gram)
+                params = ravel_pytree(taken.policy_params)[0]
+                return trust_region.propose(params, taken.directions, weights, config.max_kl, taken.fraction)
+
+            return jax.jvp(replay, (multiplier,), (jnp.ones_like(multiplier),))[1]
+
+        self._improve, self._gradients, self.step_derivative = improve, gradients, step_derivative
+
+    def improve(self, problem: PolicyProblem, multiplier: float, kl_tolerance: float) -> tuple[PyTree, PolicyStep]:
+        """The step actually taken."""
+        numbers = (jnp.asarray(multiplier), jnp.asarray(kl_tolerance))
+        return self._improve(problem.params, problem.training, problem.held_out, *numbers)
+
+    def gradients(self, taken: PolicyStep, multiplier: float, after_dual: float) -> dict[str, float]:
+        """The outer gradient of every kind."""
+        found = self._gradients(taken, jnp.asarray(multiplier), jnp.asarray(after_dual))
+        return {kind: float(value) for kind, value in zip(KINDS, found, strict=True)}
+
+
+@pytest.fixture(scope="module")
+def learner() -> Learner:
+    """Conjugate gradients truncated at 4 of 28 iterations, on every second sample."""
+    with jax.enable_x64(True):
+        return Learner()
+
+
+def numpy_loss(problem: PolicyProblem, new_params: PyTree | None, multiplier: float) -> float:
+    """The held-out loss in NumPy, from the parameters of a step that was taken; w = 1 without."""
+    held_out = problem.held_out
+    weights = np.ones(len(held_out.cost))
+    if new_params is not None:
+        weights = np.exp(numpy_log_prob(new_params, held_out) - numpy_log_prob(problem.params, held_out))
+    residual = weights * np.asarray(held_out.reward_advantage) - multiplier * np.asarray(held_out.cost)
+    return float(np.mean(residual**2))
+
+
+CASES = [
+    # seed, lambda, KL tolerance: the radius 0.02 is met by the full step, so 0.4 of it by the half
+    (0, 0.01, 1.5, 1.0),
+    (1, 0.8, 1.5, 1.0),
+    (2, 2.5, 1.5, 1.0),
+    (3, 1.2, 0.4, 0.5),
+]
+
+
+@pytest.mark.parametrize(("seed", "multiplier", "kl_tolerance", "fraction"), CASES)
+def test_the_steps_derivative_is_the_central_difference_of_the_step_taken(
+    learner: Learner, seed: int, multiplier: float, kl_tolerance: float, fraction: float
+) -> None:
+    with jax.enable_x64(True):
+        problem = policy_problem(seed, np.float64)
+        taken = learner.improve(problem, multiplier, kl_tolerance)[1]
+        assert taken.fraction == fraction
+        after, before = (learner.improve(problem, multiplier + s * STEP, kl_tolerance)[0] for s in (1, -1))
+        difference = np.asarray(ravel_pytree(after)[0] - ravel_pytree(before)[0]) / (2 * STEP)
+        derivative = np.asarray(learner.step_derivative(taken, jnp.asarray(multiplier)))
+    assert np.linalg.norm(difference) > 1e-3  # there is something to find
+    np.testing.assert_allclose(derivative, difference, rtol=0, atol=1e-6 * np.linalg.norm(difference))
+
+
+@pytest.mark.parametrize(("seed", "multiplier", "kl_tolerance", "fraction"), CASES)
+def test_the_outer_gradient_is_the_central_difference_of_the_loss_of_the_step_taken(
+    learner: Learner, seed: int, multiplier: float, kl_tolerance: float, fraction: float
+) -> None:
+    after_dual = multiplier + 0.07
+    with jax.enable_x64(True):
+        problem = policy_problem(seed, np.float64)
+        new, taken = learner.improve(problem, multiplier, kl_tolerance)
+        assert taken.fraction == fraction
+        moved = [learner.improve(problem, multiplier + s * STEP, kl_tolerance)[0] for s in (1, -1)]
+        found = learner.gradients(taken, multiplier, after_dual)
+        losses = {  # d lambda / d lambda' = 1: both move together in the total derivative
+            "full": [numpy_loss(problem, moved[i], after_dual + s * STEP) for i, s in enumerate((1, -1))],
+            "direct": [numpy_loss(problem, None, after_dual + s * STEP) for s in (1, -1)],
+            "indirect": [numpy_loss(problem, params, after_dual) for params in moved],
+        }
+        held_out, log_ratio = problem.held_out, numpy_log_prob(new, problem.held_out)
+        weights = np.exp(log_ratio - numpy_log_prob(problem.params, problem.held_out))
+    for kind, (up, down) in losses.items():
+        np.testing.assert_allclose(found[kind], (up - down) / (2 * STEP), rtol=1e-6, atol=1e-9, err_msg=kind)
+    assert abs(found["indirect"]) > 1e-4  # there is something to find
+    # The total derivative is that path plus the explicit one at the step's own importance weights.
+    reward, cost = np.asarray(held_out.reward_advantage), np.asarray(held_out.cost)
+    explicit = np.mean(-2 * cost * (weights * reward - after_dual * cost))
+    np.testing.assert_allclose(found["full"], explicit + found["indirect"], rtol=1e-10)
+
+
+def test_the_closed_form_in_two_dimensions() -> None:
+    """F = [[2, 1], [1, 2]], g_r = (3, 0), g_c = (0, 3), radius 1, lambda 1, all by hand.
+
+    x_r = (2, -1), x_c = (-1, 2); a = 6, b = -3, c = 6; x = (3, -3), q = 6 + 6 + 6 = 18; sqrt(2 / 18) = 1/3.
+    theta' - theta = (1, -1); d theta' / d lambda = -1/3 [(-1, 2) - (3, -3) (-3 - 6) / 18] = (-1/6, -1/6).
+    """
+    fisher, gradients = jnp.array([[2.0, 1.0], [1.0, 2.0]]), jnp.array([[3.0, 0.0], [0.0, 3.0]])
+    along = trust_region.directions(lambda v: v @ fisher, gradients, 2)
+    np.testing.assert_allclose(along.x, [[2, -1], [-1, 2]], rtol=1e-5)
+    np.testing.assert_allclose(along.gram, [[6, -3], [-3, 6]], rtol=1e-5)
+    constraint, theta = constraints.lagrangian(Config()), jnp.array([10.0, 20.0])
+
+    def step(multiplier: jax.Array, fraction: float) -> jax.Array:
+        weights = constraint.combine(multiplier, jnp.zeros(()), along.gram)
+        return trust_region.propose(theta, along, weights, 1.0, fraction)
+
+    one = jnp.ones(())
+    np.testing.assert_allclose(step(one, 1.0), [11, 19], rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(step)(one, 1.0), [-1 / 6, -1 / 6], rtol=1e-5)
+    np.testing.assert_allclose(jax.jacfwd(step)(one, 0.5), [-1 / 12, -1 / 12], rtol=1e-5)  # eta is a constant factor
+    assert np.all(jax.jacfwd(step)(one, 0.0) == 0)
+
+
+# A step that was rejected ----------------------------------------------------------------------------------------------
+
+
+def test_a_rejected_step_has_no_indirect_gradient(learner: Learner) -> None:
+    with jax.enable_x64(True):
+        problem = policy_problem(1, np.float64)
+        new, taken = learner.improve(problem, 0.8, 0.0)  # no KL is within 0
+        found = learner.gradients(taken, 0.8, 0.9)
+        assert float(taken.fraction) == 0
+    assert same_bits(new, problem.params)
+    assert found["indirect"] == 0.0
+    np.testing.assert_allclose(found["full"], found["direct"], rtol=1e-12)  # w = 1
+
+
+@pytest.mark.parametrize("field", ["reward_advantage", "cost_advantage", "action"])
+def test_a_non_finite_step_has_no_indirect_gradient_and_keeps_the_direct_one(learner: Learner, field: str) -> None:
+    """A NaN in the training samples alone: the held-out loss itself is sound."""
+    with jax.enable_x64(True):
+        problem = policy_problem(1, np.float64)
+        numbers = (jnp.asarray(0.8), jnp.asarray(1.5))
+        bad = problem.training.replace(**{field: getattr(problem.training, field).at[0].set(jnp.nan)})
+        new, taken = learner._improve(problem.params, bad, problem.held_out, *numbers)
+        found = learner.gradients(taken, 0.8, 0.9)
+        assert float(taken.fraction) == 0
+    assert same_bits(new, problem.params)
+    assert found["indirect"] == 0.0
+    np.testing.assert_allclose(found["full"], found["direct"], rtol=1e-12)
+
+
+def test_cancelling_directions_have_a_finite_derivative() -> None:
+    x = jnp.array([[1.0, 2.0], [1.0, 2.0]])
+    along, constraint = Directions(x=x, gram=x @ x.T), constraints.lagrangian(Config())
+
+    def step(multiplier: jax.Array) -> jax.Array:
+        weights = constraint.combine(multiplier, jnp.zeros(()), along.gram)
+        return trust_region.propose(jnp.zeros(2), along, weights, 0.01, 1.0)
+
+    assert np.all(jax.jacfwd(step)(jnp.ones(())) == 0)
+
+
+# The outer step --------------------------------------------------------------------------------------------------------
+
+
+REWARD, COST = np.array([1.0, -2.0, 3.0, 0.5]), np.array([1.0, 0.0, 1.0, 2.0])
+FIXED_POINT = (1 + 3 + 1) / (1 + 1 + 4)  # mean(A_r d) / mean(d^2)
+
+
+def constant_weights(value: float) -> Outer:
+    """An outer problem whose importance weights do not depend on the multiplier."""
+    return Outer(
+        reward_advantage=jnp.asarray(REWARD),
+        cost=jnp.asarray(COST),
+        importance_weights=lambda multiplier: jnp.full(4, value) + 0 * multiplier,
+    )
+
+
+def meta_step(config: Config, multiplier: float, gap: float, outer: Outer) -> tuple[float, dict[str, float]]:
+    constraint = constraints.meta_lagrangian(config)
+    state = constraint.init()
+    written = jnp.log(jnp.expm1(multiplier)) if config.multiplier_update == "adam" else jnp.asarray(multiplier)
+    state, metrics = constraint.update(state.replace(parameter=written), jnp.asarray(gap), outer)
+    return float(constraint.multiplier(state)), {name: float(value) for name, value in metrics.items()}
+
+
+def test_direct_vanishes_at_its_least_squares_fixed_point_and_leads_there() -> None:
+    gradient = jax.jit(lambda after: constraints.outer_gradient("direct", after, after, constant_weights(5.0)))
+    np.testing.assert_allclose(gradient(jnp.asarray(FIXED_POINT)), 0, atol=1e-6)
+    assert gradient(jnp.asarray(FIXED_POINT - 0.1)) < 0 < gradient(jnp.asarray(FIXED_POINT + 0.1))
+    config = Config(meta_gradient="direct", multiplier_update="sgd", meta_learning_rate=0.2, initial_multiplier=0.0)
+    constraint = constraints.meta_lagrangian(config)
+    update = jax.jit(lambda state: constraint.update(state, jnp.zeros(()), constant_weights(5.0))[0])
+    state: Multiplier = constraint.init()
+    for _ in range(60):
+        state = update(state)
+    np.testing.assert_allclose(constraint.multiplier(state), FIXED_POINT, rtol=1e-4)
+
+
+def test_the_outer_step_follows_the_dual_step() -> None:
+    """lambda 1, gap 2: lambda' = 1 + 0.05 * 2 = 1.1. dL/dlambda' = -2 mean(d (A_r - 1.1 d)) = -2 (5 - 6.6) / 4 = 0.8.
+
+    lambda'' = 1.1 - 0.25 * 0.8 = 0.9.
+    """
+    config = Config(meta_gradient="direct", multiplier_update="sgd", meta_learning_rate=0.25)
+    multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(1.0))
+    np.testing.assert_allclose(metrics["meta_gradient"], 0.8, rtol=1e-5)
+    np.testing.assert_allclose(multiplier, 0.9, rtol=1e-5)
+    # Full, with w = 3 whatever lambda: -2 (15 - 6.6) / 4 = -4.2, lambda'' = 1.1 + 1.05.
+    multiplier, metrics = meta_step(config.replace(meta_gradient="full"), 1.0, 2.0, constant_weights(3.0))
+    np.testing.assert_allclose(metrics["meta_gradient"], -4.2, rtol=1e-5)
+    np.testing.assert_allclose(multiplier, 2.15, rtol=1e-5)
+    # Indirect: such weights have no path through theta'.
+    multiplier, metrics = meta_step(config.replace(meta_gradient="indirect"), 1.0, 2.0, constant_weights(3.0))
+    assert metrics["meta_gradient"] == 0
+    np.testing.assert_allclose(multiplier, 1.1, rtol=1e-6)
+
+
+def test_adam_writes_the_outer_step_through_softplus() -> None:
+    config = Config(meta_gradient="direct", multiplier_update="adam", meta_learning_rate=0.25)
+    dual = float(np.log1p(np.exp(np.log(np.expm1(1.0)) + 0.05)))  # Adam's first step is its rate
+    gradient = -2 * np.mean(COST * (REWARD - dual * COST))
+    multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(1.0))
+    np.testing.assert_allclose(metrics["meta_gradient"], gradient, rtol=1e-4)
+    np.testing.assert_allclose(multiplier, dual - 0.25 * gradient, rtol=1e-5)
+
+
+@pytest.mark.parametrize("form", ["adam", "sgd"])
+def test_the_outer_step_keeps_the_multiplier_within_its_bounds(form: str) -> None:
+    config = Config(meta_gradient="direct", multiplier_update=form, meta_learning_rate=1e4, multiplier_max=5.0)
+    lowest = 0.0 if form == "sgd" else 1e-3  # no xi reaches 0
+    np.testing.assert_allclose(meta_step(config, 2.0, 0.0, constant_weights(1.0))[0], lowest, rtol=1e-4)
+    assert meta_step(config, 0.2, 0.0, constant_weights(1.0))[0] == 5.0
+
+
+@pytest.mark.parametrize("kind", ["full", "indirect"])
+def test_a_non_finite_outer_gradient_moves_nothing(kind: str) -> None:
+    config = Config(meta_gradient=kind, multiplier_update="sgd", meta_learning_rate=0.25)
+    multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(np.nan))
+    assert metrics["meta_gradient"] == 0
+    np.testing.assert_allclose(multiplier, 1.1, rtol=1e-6)  # the dual step alone
+
+
+def test_meta_gradient_none_is_the_lagrangian() -> None:
+    config = Config(meta_gradient="none", multiplier_update="sgd")
+    multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(1.0))
+    np.testing.assert_allclose(multiplier, 1.1, rtol=1e-6)
+    assert not metrics
+
+
+# The split -------------------------------------------------------------------------------------------------------------
+
+
+def numbered(size: int) -> Batch:
+    rows = jnp.arange(float(size))
+    columns = {name: rows for name in ("reward_advantage", "cost_advantage", "cost")}
+    return Batch(obs=rows[:, None], action=rows[:, None], returns=jnp.stack([rows, rows], 1), **columns)
+
+
+def test_the_split_is_a_random_partition_with_rows_kept_together() -> None:
+    held_out, training = policy_step.split(numbered(20), 6, jax.random.key(0))
+    assert held_out.cost.shape == (6,)
+    assert training.cost.shape == (14,)
+    np.testing.assert_array_equal(np.sort(np.concatenate([held_out.cost, training.cost])), np.arange(20))
+    for part in (held_out, training):
+        for column in jax.tree.leaves(part):
+            np.testing.assert_array_equal(column.reshape(len(part.cost), -1)[:, 0], part.cost)
+    other, _ = policy_step.split(numbered(20), 6, jax.random.key(1))
+    assert not np.array_equal(held_out.cost, other.cost)
+
+
+def test_without_held_out_samples_the_batch_stays_as_it_is() -> None:
+    held_out, training = policy_step.split(numbered(20), 0, jax.random.key(0))
+    assert held_out.cost.shape == (0,)
+    assert same_bits(training, numbered(20))

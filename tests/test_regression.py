@@ -1,0 +1,75 @@
+"""Critic regression: what it learns, and which samples each of its gradient steps sees."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ccil_jax import regression
+from ccil_jax.regression import Critic
+
+BETA = 0.9  # of Adam's first moment
+
+
+def fit(obs: Any, target: Any, params: Any, **changes: Any) -> tuple[Critic, jax.Array]:
+    options: dict[str, Any] = {"learning_rate": 0.0, "num_epochs": 1, "minibatch_size": 4} | changes
+    critic = regression.init(jnp.asarray(params), options["learning_rate"])
+    key = jax.random.key(options.pop("seed", 0))
+
+    def apply(params: jax.Array, obs: jax.Array) -> jax.Array:
+        return obs @ params
+
+    return regression.fit(apply, critic, jnp.asarray(obs), jnp.asarray(target), key, **options)
+
+
+def test_recovers_a_linear_function() -> None:
+    rng = np.random.default_rng(0)
+    obs, truth = rng.normal(size=(130, 3)).astype(np.float32), np.array([1.0, -2.0, 0.5], np.float32)
+    critic, loss = fit(obs, obs @ truth, np.zeros(3, np.float32), learning_rate=0.03, num_epochs=60, minibatch_size=16)
+    np.testing.assert_allclose(critic.params, truth, atol=1e-3)
+    assert loss < 1e-5
+
+
+def steps_since_seen(num_samples: int, minibatch_size: int, seed: int) -> np.ndarray:
+    """For one epoch: how many gradient steps followed the one that saw each sample; NaN if none did.
+
+    Sample i has observation e_i and target 1, parameters stay 0, so only a step that sees i has a gradient in entry
+    i, -2 / minibatch_size, and Adam's first moment remembers when: (1 - BETA) BETA^(steps since) times it.
+    """
+    eye = np.eye(num_samples, dtype=np.float32)
+    critic, _ = fit(eye, np.ones(num_samples, np.float32), eye[0] * 0, minibatch_size=minibatch_size, seed=seed)
+    moment = np.asarray(critic.optimizer[0].mu) / (-2 / minibatch_size * (1 - BETA))
+    with np.errstate(divide="ignore"):
+        steps = np.log(moment) / np.log(BETA)
+    return np.where(moment == 0, np.nan, steps)
+
+
+def test_an_epoch_shows_every_sample_exactly_once_in_full_minibatches() -> None:
+    steps = steps_since_seen(12, 4, seed=0)
+    np.testing.assert_allclose(np.sort(steps), np.repeat([0, 1, 2], 4), atol=1e-4)
+    assert not np.allclose(steps, steps_since_seen(12, 4, seed=1))  # in a random order
+
+
+def test_the_last_partial_minibatch_is_dropped() -> None:
+    steps = steps_since_seen(11, 4, seed=0)
+    assert np.isnan(steps).sum() == 3
+    np.testing.assert_allclose(np.sort(steps[~np.isnan(steps)]), np.repeat([0, 1], 4), atol=1e-4)
+
+
+def test_epochs_are_shuffled_anew() -> None:
+    eye = np.eye(12, dtype=np.float32)
+    critic, _ = fit(eye, np.ones(12, np.float32), eye[0] * 0, num_epochs=2)
+    moment = np.asarray(critic.optimizer[0].mu) / (-2 / 4 * (1 - BETA))
+    # A sample seen j steps before the end of one epoch and k before the end of the other, 3 steps to an epoch.
+    sums = {BETA ** (3 + j) + BETA**k for j in range(3) for k in range(3)}
+    assert all(min(abs(m - s) for s in sums) < 1e-5 for m in moment)
+    assert any(min(abs(m - BETA ** (3 + j) - BETA**j) for j in range(3)) > 1e-4 for m in moment)  # not the same order
+    assert critic.optimizer[0].count == 6
+
+
+def test_the_loss_is_the_mean_square_error_of_the_last_epoch() -> None:
+    rng = np.random.default_rng(0)
+    obs, target, params = rng.normal(size=(8, 2)), rng.normal(size=8), np.array([0.3, -0.1])
+    _, loss = fit(obs.astype(np.float32), target.astype(np.float32), params.astype(np.float32), num_epochs=2)
+    np.testing.assert_allclose(loss, np.mean((obs @ params - target) ** 2), rtol=1e-5)

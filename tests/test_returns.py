@@ -1,0 +1,82 @@
+"""Generalised advantage estimation against plain loops and values typed by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ccil_jax.returns import gae
+
+
+def loop(
+    signal: np.ndarray,
+    value: np.ndarray,
+    next_value: np.ndarray,
+    terminated: np.ndarray,
+    done: np.ndarray,
+    gamma: float,
+    gae_lambda: float,
+) -> np.ndarray:
+    """The definition, sum by sum: for every step, the decayed residuals up to the end of its episode or of the batch."""
+    num_steps, num_envs = signal.shape
+    advantage = np.zeros((num_steps, num_envs))
+    for n in range(num_envs):
+        for t in range(num_steps):
+            weight = 1.0
+            for k in range(t, num_steps):
+                future = 0.0 if terminated[k, n] else gamma * next_value[k, n]
+                advantage[t, n] += weight * (signal[k, n] + future - value[k, n])
+                if done[k, n]:
+                    break
+                weight *= gamma * gae_lambda
+    return advantage
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_against_a_loop_with_terminations_and_truncations_mixed(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    signal, value, next_value = rng.normal(size=(3, 40, 5))
+    terminated = rng.uniform(size=(40, 5)) < 0.1
+    truncated = rng.uniform(size=(40, 5)) < 0.1
+    done = terminated | truncated
+    done[:, 4], terminated[:, 4] = False, False  # one simulation whose episode outlasts the batch
+    with jax.enable_x64(True):
+        arrays = [jnp.asarray(x) for x in (signal, value, next_value, terminated, done)]
+        advantage, returns = jax.jit(gae)(*arrays, 0.9, 0.8)
+    expected = loop(signal, value, next_value, terminated, done, 0.9, 0.8)
+    np.testing.assert_allclose(advantage, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(returns, expected + value, rtol=1e-12, atol=1e-12)
+
+
+def test_values_typed_by_hand() -> None:
+    # gamma 1/2, lambda 1/2. Steps: goes on, terminates (its next value must not count), truncated (it must).
+    column = {
+        "signal": [1.0, 2.0, 3.0],
+        "value": [4.0, 8.0, 2.0],
+        "next_value": [8.0, 100.0, 6.0],
+        "terminated": [False, True, False],
+        "done": [False, True, True],
+    }
+    arrays = [jnp.array(x)[:, None] for x in column.values()]
+    advantage, returns = gae(*arrays, 0.5, 0.5)
+    # residuals: 1 + 4 - 4 = 1; 2 + 0 - 8 = -6; 3 + 3 - 2 = 4. The first step's sum: 1 + 1/4 * -6 = -1/2.
+    np.testing.assert_array_equal(advantage[:, 0], [-0.5, -6.0, 4.0])
+    np.testing.assert_array_equal(returns[:, 0], [3.5, 2.0, 6.0])
+
+
+def test_lambda_one_gives_discounted_sums_and_lambda_zero_residuals() -> None:
+    signal = jnp.array([[1.0], [2.0], [4.0]])
+    value, next_value = jnp.array([[3.0], [5.0], [7.0]]), jnp.array([[5.0], [7.0], [8.0]])
+    never = jnp.zeros((3, 1), bool)
+    _, returns = gae(signal, value, next_value, never, never, 0.5, 1.0)
+    np.testing.assert_array_equal(returns[:, 0], [1 + 1 + 1 + 1, 2 + 2 + 2, 4 + 4])  # ... + gamma^k V(s_T), V = 8
+    advantage, _ = gae(signal, value, next_value, never, never, 0.5, 0.0)
+    np.testing.assert_array_equal(advantage[:, 0], [1 + 2.5 - 3, 2 + 3.5 - 5, 4 + 4 - 7])
+
+
+def test_bootstraps_from_the_true_successor_and_not_from_the_reset_state() -> None:
+    """A column of values in which V(s_T) = 10 and the next episode begins with V(s_0) = -10."""
+    signal, done = jnp.zeros((2, 1)), jnp.array([[True], [False]])
+    value, next_value = jnp.array([[1.0], [-10.0]]), jnp.array([[10.0], [1.0]])
+    advantage, _ = gae(signal, value, next_value, jnp.zeros((2, 1), bool), done, 0.5, 0.9)
+    assert advantage[0, 0] == 0.5 * 10.0 - 1.0  # from the reset state it would be 0.5 * -10 - 1
