@@ -60,9 +60,9 @@ def make_policy(config: Config, obs_dim: int, action_dim: int) -> Policy:
     return Policy(init, apply)
 
 
-def make_scalar(config: Config, input_dim: int) -> Network:
+def make_scalar(config: Config, input_dim: int, final_scale: float = 1.0) -> Network:
     """A critic or discriminator: [..., input_dim] -> [...]."""
-    mlp = _mlp(config, 1, final_scale=1.0)
+    mlp = _mlp(config, 1, final_scale)
 
     def init(key: jax.Array) -> PyTree:
         return mlp.init(key, jnp.zeros((1, input_dim)))

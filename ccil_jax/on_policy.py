@@ -62,7 +62,8 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     critic = networks.make_scalar(config, env.obs_dim)
     if method.reward == "discriminator":
         assert expert is not None, f"{config.method} learns from demonstrations"
-        network = networks.make_scalar(config, env.obs_dim + env.action_dim)
+        # A small last layer: an untrained discriminator must not reward anything in particular.
+        network = networks.make_scalar(config, env.obs_dim + env.action_dim, final_scale=0.01)
         bounds = (jnp.asarray(env.action_low), jnp.asarray(env.action_high))
         reward_model = reward_models.discriminator(config, network, expert, bounds, env.obs_dim)
     else:

@@ -38,7 +38,7 @@ class Locomotion:
         contact_cost: whether the contact term counts in the cost (Ant, Humanoid). With the simulator of the
             paper's authors it was zero; without it no contact forces are computed.
         max_episode_steps: control steps until truncation.
-        num_threads: of the native backend; None takes all usable CPUs.
+        num_threads: of the native backend; None shares the usable CPUs among the local devices.
     """
 
     def __init__(

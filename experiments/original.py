@@ -128,11 +128,13 @@ def run_episode(
 def score(env: Any, steps: dict[str, np.ndarray], contact_cost: bool) -> tuple[float, float, int]:
     """Return, cost and length of an episode under the task's rule."""
     import jax
+    import jax.numpy as jnp
 
     from envs.locomotion_tasks import CostInputs
 
     reward = sum(steps[name] for name in env.task.reward_terms)
     contact = -steps["contact"] if contact_cost else np.zeros_like(steps["contact"])
-    inputs = CostInputs(velocity=steps["velocity"], control_cost=-steps["control"], contact_cost=contact)
+    velocity, control, contact = (jnp.asarray(x) for x in (steps["velocity"], -steps["control"], contact))
+    inputs = CostInputs(velocity=velocity, control_cost=control, contact_cost=contact)
     cost = np.asarray(jax.vmap(env.task.cost_quantity)(inputs)) > env.cost_threshold
     return float(np.sum(reward)), float(np.sum(cost)), len(cost)

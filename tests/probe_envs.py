@@ -3,7 +3,9 @@
 They implement the contract of `envs.base` in plain JAX, so a whole training program compiles in seconds.
 """
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -175,6 +177,17 @@ def walk_demonstrations() -> Demonstrations:
         truncated=last,
         episode_ends=ends,
     )
+
+
+@contextlib.contextmanager
+def quick_compilation() -> Iterator[None]:
+    """Lets XLA emit plain code: a training program compiles in a third of the time. For what does not depend on it."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
 
 
 WALK_DEMONSTRATIONS_COST = 2.25  # J_E of the above

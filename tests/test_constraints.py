@@ -98,7 +98,11 @@ def test_inverse_softplus_of_what_no_xi_reaches_is_the_smallest_allowed() -> Non
 def test_the_table_and_the_configuration_agree_on_whose_limit_holds() -> None:
     assert {name for name, row in METHODS.items() if row.limit == "prescribed"} == PRESCRIBED_LIMIT_METHODS
     unconstrained = {name for name, row in METHODS.items() if row.limit == "none"}
-    assert unconstrained == {"gail", "trpo"} == {n for n, r in METHODS.items() if r.constraint is constraints.unconstrained}
+    assert (
+        unconstrained
+        == {"gail", "trpo"}
+        == {n for n, r in METHODS.items() if r.constraint is constraints.unconstrained}
+    )
 
 
 def test_lagrangian_combines_reward_less_lambda_times_cost_and_gail_ignores_the_cost() -> None:
@@ -159,7 +163,9 @@ def test_no_other_method_gates_its_advantages() -> None:
 # Entropy -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "gate"), [("gail", "batch"), ("ccil", "batch"), ("cvag", "batch"), ("cvag", "episode")])
+@pytest.mark.parametrize(
+    ("name", "gate"), [("gail", "batch"), ("ccil", "batch"), ("cvag", "batch"), ("cvag", "episode")]
+)
 def test_the_entropy_bonus_counts_once_in_every_direction_of_the_step(name: str, gate: str) -> None:
     """Without advantages only the bonus beta sum(log_std) is left: gradient beta per log-std entry and nothing else.
 

@@ -132,7 +132,9 @@ def test_partial_first_episodes_are_not_counted(counter_batches: list[Transition
     assert history == [(99.0, 0), (10.0, 2), (10.0, 1)]
 
 
-def test_next_obs_is_the_true_successor_and_the_next_obs_after_an_end_a_reset(counter_batches: list[Transition]) -> None:
+def test_next_obs_is_the_true_successor_and_the_next_obs_after_an_end_a_reset(
+    counter_batches: list[Transition],
+) -> None:
     steps = joined(counter_batches)
     np.testing.assert_array_equal(steps.next_obs, steps.obs + 1)  # also at an end: 5, never 0
     following = np.where(steps.done[:-1, :, None], 0, steps.next_obs[:-1])

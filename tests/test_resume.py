@@ -7,20 +7,21 @@ import numpy as np
 
 from ccil_jax import runner
 from ccil_jax.runner import Result
-from tests.probe_envs import Walk, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 
 def train(directory: Path | None = None, *, resume: bool = False, stop_after: int | None = None) -> Result:
-    return runner.train(
-        walk_config(method="malm"),
-        Walk(),
-        walk_demonstrations(),
-        num_seeds=2,
-        seed=3,
-        checkpoint_dir=directory,
-        resume=resume,
-        stop_after=stop_after,
-    )
+    with quick_compilation():
+        return runner.train(
+            walk_config(method="malm"),
+            Walk(),
+            walk_demonstrations(),
+            num_seeds=2,
+            seed=3,
+            checkpoint_dir=directory,
+            resume=resume,
+            stop_after=stop_after,
+        )
 
 
 def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:

@@ -154,7 +154,9 @@ def test_curvature_that_is_not_positive_freezes(matrix: np.ndarray, b: list[floa
 # The step ------------------------------------------------------------------------------------------------------------
 
 
-def improve(problem: PolicyProblem, multiplier: float, **changes: Any) -> tuple[PyTree, policy_step.PolicyStep, Metrics]:
+def improve(
+    problem: PolicyProblem, multiplier: float, **changes: Any
+) -> tuple[PyTree, policy_step.PolicyStep, Metrics]:
     """The Lagrangian step of a problem, jitted."""
     config = problem.config.replace(**changes)
 

@@ -34,7 +34,7 @@ def make_physics(
         num_substeps: engine steps per control step.
         fields: derived `MjData` arrays that `Data.fields` shall hold, e.g. "cfrc_ext".
         track: `MjData` arrays whose change over the control step `Data.change` shall hold, e.g. "qpos".
-        num_threads: of `native`; None takes all usable CPUs. The other backends ignore it.
+        num_threads: of `native`; None shares the usable CPUs among the local devices. The other backends ignore it.
 
     Raises:
         ValueError: unknown name.

@@ -48,7 +48,7 @@ class NativePhysics:
         fields: derived `MjData` arrays for `Data.fields`. If there are any, `init` runs the engine's forward pass.
         track: `MjData` arrays for `Data.change`. Derived ones are compared with their value after the last control
             step, as gymnasium does, so they are carried along in the bits.
-        num_threads: None takes all usable CPUs.
+        num_threads: of one engine; None shares the usable CPUs among the local devices.
     """
 
     name = "native"
@@ -64,7 +64,8 @@ class NativePhysics:
     ):
         self._model = model
         self._num_substeps = num_substeps
-        self._num_threads = num_threads or usable_cpus()
+        # Each of JAX's CPU devices runs its own simulations, side by side with the others.
+        self._num_threads = num_threads or max(1, usable_cpus() // jax.local_device_count())
         self._lock = threading.Lock()
         self._idle_engines: dict[int, list[Engine]] = {}  # by number of simulations; a call holds one for itself
         self._fields, self._track = tuple(fields), tuple(track)
