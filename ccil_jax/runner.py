@@ -57,6 +57,14 @@ class Result:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Loaded:
+    """A trained agent from disk."""
+
+    config: Config
+    agent: Actor  # [num_seeds]-leading
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Program:
     """The compiled functions of one configuration."""
 
@@ -223,6 +231,36 @@ def train(
         compile_seconds=program.compile_seconds,
         wall_seconds=time.perf_counter() - start,
     )
+
+
+def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
+    """The policies of the newest checkpoint in `checkpoint_dir`. Demonstrations are not needed.
+
+    Raises:
+        FileNotFoundError: there is no finished checkpoint.
+    """
+    config = config.replace(cost_limit=config.cost_limit or 0.0)
+    steps = ExpertData(
+        obs=jnp.zeros((1, env.obs_dim)),
+        action=jnp.zeros((1, env.action_dim)),
+        held_out_obs=jnp.zeros((1, env.obs_dim)),
+        held_out_action=jnp.zeros((1, env.action_dim)),
+    )  # only their widths matter
+
+    def init(key: jax.Array) -> AgentState:
+        return jax.vmap(on_policy.make(config, env, steps).init)(jax.random.split(key, num_seeds))
+
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    like = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device),
+        jax.eval_shape(init, jax.random.key(0)),
+    )
+    with Checkpointer(checkpoint_dir) as checkpoints:
+        step = checkpoints.latest_step()
+        if step is None:
+            raise FileNotFoundError(f"{checkpoint_dir}: holds no finished checkpoint")
+        saved = checkpoints.restore(step, {"state": like, "history": checkpoints.structure(step)["history"]})
+    return Loaded(config=config, agent=saved["state"].actor)
 
 
 def _rows(metrics: Metrics, done: int, config: Config) -> History:

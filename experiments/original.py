@@ -133,8 +133,10 @@ def score(env: Any, steps: dict[str, np.ndarray], contact_cost: bool) -> tuple[f
     from envs.locomotion_tasks import CostInputs
 
     reward = sum(steps[name] for name in env.task.reward_terms)
-    contact = -steps["contact"] if contact_cost else np.zeros_like(steps["contact"])
-    velocity, control, contact = (jnp.asarray(x) for x in (steps["velocity"], -steps["control"], contact))
-    inputs = CostInputs(velocity=velocity, control_cost=control, contact_cost=contact)
+    inputs = CostInputs(
+        velocity=jnp.asarray(steps["velocity"]),
+        control_cost=jnp.asarray(-steps["control"]),
+        contact_cost=jnp.asarray(-steps["contact"] * contact_cost),
+    )
     cost = np.asarray(jax.vmap(env.task.cost_quantity)(inputs)) > env.cost_threshold
     return float(np.sum(reward)), float(np.sum(cost)), len(cost)

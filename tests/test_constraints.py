@@ -1,8 +1,6 @@
 """How the cost enters: dual steps, the gates of CVAG, and the entropy bonus."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp

@@ -154,7 +154,7 @@ def test_the_closed_form_in_two_dimensions() -> None:
     assert np.all(jax.jacfwd(step)(one, 0.0) == 0)
 
 
-# A step that was rejected ----------------------------------------------------------------------------------------------
+# A step that was rejected --------------------------------------------------------------------------------------------
 
 
 def test_a_rejected_step_has_no_indirect_gradient(learner: Learner) -> None:
@@ -194,7 +194,7 @@ def test_cancelling_directions_have_a_finite_derivative() -> None:
     assert np.all(jax.jacfwd(step)(jnp.ones(())) == 0)
 
 
-# The outer step --------------------------------------------------------------------------------------------------------
+# The outer step ------------------------------------------------------------------------------------------------------
 
 
 REWARD, COST = np.array([1.0, -2.0, 3.0, 0.5]), np.array([1.0, 0.0, 1.0, 2.0])
@@ -282,12 +282,12 @@ def test_meta_gradient_none_is_the_lagrangian() -> None:
     assert not metrics
 
 
-# The split -------------------------------------------------------------------------------------------------------------
+# The split -----------------------------------------------------------------------------------------------------------
 
 
 def numbered(size: int) -> Batch:
     rows = jnp.arange(float(size))
-    columns = {name: rows for name in ("reward_advantage", "cost_advantage", "cost")}
+    columns = dict.fromkeys(("reward_advantage", "cost_advantage", "cost"), rows)
     return Batch(obs=rows[:, None], action=rows[:, None], returns=jnp.stack([rows, rows], 1), **columns)
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import networks, on_policy, running_statistics, runner
+from ccil_jax import networks, on_policy, runner, running_statistics
 from ccil_jax.config import Config
 from ccil_jax.runner import Result
 from tests.probe_envs import Conflict, Sign, quick_compilation

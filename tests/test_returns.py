@@ -17,7 +17,7 @@ def loop(
     gamma: float,
     gae_lambda: float,
 ) -> np.ndarray:
-    """The definition, sum by sum: for every step, the decayed residuals up to the end of its episode or of the batch."""
+    """The definition: for every step, the decayed sum of residuals up to the end of its episode or of the batch."""
     num_steps, num_envs = signal.shape
     advantage = np.zeros((num_steps, num_envs))
     for n in range(num_envs):
@@ -50,15 +50,10 @@ def test_against_a_loop_with_terminations_and_truncations_mixed(seed: int) -> No
 
 def test_values_typed_by_hand() -> None:
     # gamma 1/2, lambda 1/2. Steps: goes on, terminates (its next value must not count), truncated (it must).
-    column = {
-        "signal": [1.0, 2.0, 3.0],
-        "value": [4.0, 8.0, 2.0],
-        "next_value": [8.0, 100.0, 6.0],
-        "terminated": [False, True, False],
-        "done": [False, True, True],
-    }
-    arrays = [jnp.array(x)[:, None] for x in column.values()]
-    advantage, returns = gae(*arrays, 0.5, 0.5)
+    signal, value = jnp.array([[1.0], [2.0], [3.0]]), jnp.array([[4.0], [8.0], [2.0]])
+    next_value = jnp.array([[8.0], [100.0], [6.0]])
+    terminated, done = jnp.array([[False], [True], [False]]), jnp.array([[False], [True], [True]])
+    advantage, returns = gae(signal, value, next_value, terminated, done, 0.5, 0.5)
     # residuals: 1 + 4 - 4 = 1; 2 + 0 - 8 = -6; 3 + 3 - 2 = 4. The first step's sum: 1 + 1/4 * -6 = -1/2.
     np.testing.assert_array_equal(advantage[:, 0], [-0.5, -6.0, 4.0])
     np.testing.assert_array_equal(returns[:, 0], [3.5, 2.0, 6.0])

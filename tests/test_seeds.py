@@ -60,14 +60,14 @@ class Compiled:
 
 
 @pytest.fixture(scope="module")
-def compiled() -> Iterator[Compiled]:
+def compiled() -> Compiled:
     env, demonstrations, listener = TracedWalk(), walk_demonstrations(), Compilations()
     config = runner.resolve(walk_config(method="malm"), env, demonstrations)
     expert = runner.expert_data(demonstrations)
     jax.monitoring.register_event_duration_secs_listener(listener)
     program = runner.compile_program(config, env, expert, NUM_SEEDS)
     jax.monitoring.unregister_event_duration_listener(listener)
-    yield Compiled(program, listener.names, len(env.traces), env)
+    return Compiled(program, listener.names, len(env.traces), env)
 
 
 def run(program: Program, keys: jax.Array) -> tuple[AgentState, list[Metrics]]:

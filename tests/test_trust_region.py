@@ -101,9 +101,9 @@ def test_conjugate_gradient_against_a_dense_solve_with_two_right_hand_sides() ->
 def test_truncated_conjugate_gradient_minimises_over_the_krylov_space_and_tells_its_residual() -> None:
     a, b = positive_definite(12)
     with jax.enable_x64(True):
-        x, residual = trust_region.conjugate_gradient(matrix_product(a), jnp.asarray(b), 4)
+        truncated, residual = trust_region.conjugate_gradient(matrix_product(a), jnp.asarray(b), 4)
         gram = trust_region.directions(matrix_product(a), jnp.asarray(b), 4).gram
-    x = np.asarray(x)
+    x = np.asarray(truncated)
     np.testing.assert_allclose(residual, b - x @ a, atol=1e-12)
     for row in range(2):
         krylov = np.stack([np.linalg.matrix_power(a, k) @ b[row] for k in range(4)], axis=1)
@@ -262,7 +262,7 @@ def test_a_step_that_nothing_accepts_leaves_the_parameters_bit_for_bit(outcome: 
 def test_candidates_are_halved_until_one_is_sound(outside: tuple[float, float]) -> None:
     new, fraction, metrics = step(within(0.3, (1.0, 0.7499), outside))
     assert fraction == 0.25
-    np.testing.assert_allclose(new, START + [0.25, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(new, START + np.array([0.25, 0, 0]), rtol=1e-6)
     np.testing.assert_allclose([metrics["kl"], metrics["surrogate"]], [0.7499, 1.0], rtol=1e-6)
 
 
