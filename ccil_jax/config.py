@@ -54,7 +54,9 @@ class Config:
     meta_gradient: str = _static("full", "outer step of malm: total derivative, one of its two parts, or none")
     multiplier_update: str = _static("adam", "dual step: adam on softplus(xi) (authors) or projected sgd (Algorithm 1)")
     gate: str = _static("batch", "cvag: one decision per batch (Algorithm 2) or per episode (authors)")
-    reward_form: str = _static("softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)")
+    reward_form: str = _static(
+        "softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)"
+    )
     cg_iterations: int = _static(10, "conjugate-gradient iterations (authors)")
     fisher_stride: int = _static(5, "the Fisher product uses every n-th sample (authors)")
     line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
@@ -76,7 +78,9 @@ class Config:
     multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)")
     meta_learning_rate: float = _traced(0.05, "outer step size, malm only (Table 1)")
     multiplier_max: float = _traced(100.0, "cap of the multiplier")
-    cost_limit: float | None = _traced(None, "episode cost limit; imitation takes the demonstrations' mean unless lgail")
+    cost_limit: float | None = _traced(
+        None, "episode cost limit; imitation takes the demonstrations' mean unless lgail"
+    )
 
     @property
     def num_steps(self) -> int:

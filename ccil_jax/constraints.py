@@ -187,11 +187,20 @@ def _dual_ascent(
         return Multiplier(parameter=jnp.minimum(xi, config.multiplier_max), optimizer=optimizer_state)
 
     def sgd(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
-        return state.replace(parameter=clip(state.parameter + config.multiplier_learning_rate * cost_gap))
+        return write(state, state.parameter + config.multiplier_learning_rate * cost_gap)
 
     def read_softplus(state: Multiplier) -> jax.Array:
         return clip(jax.nn.softplus(state.parameter))
 
+    def write_softplus(state: Multiplier, multiplier: jax.Array) -> Multiplier:
+        return Multiplier(parameter=inverse_softplus(clip(multiplier)), optimizer=state.optimizer)
+
+    def read(state: Multiplier) -> jax.Array:
+        return state.parameter
+
+    def write(state: Multiplier, multiplier: jax.Array) -> Multiplier:
+        return Multiplier(parameter=clip(multiplier), optimizer=state.optimizer)
+
     if config.multiplier_update == "adam":
-        return adam, read_softplus, lambda state, value: state.replace(parameter=inverse_softplus(clip(value)))
-    return sgd, lambda state: state.parameter, lambda state, value: state.replace(parameter=clip(value))
+        return adam, read_softplus, write_softplus
+    return sgd, read, write

@@ -55,7 +55,8 @@ def make_policy(config: Config, obs_dim: int, action_dim: int) -> Policy:
         return {"mean": mlp.init(key, jnp.zeros((1, obs_dim))), "log_std": jnp.zeros(action_dim)}
 
     def apply(params: PyTree, obs: Float[Array, "... D"]) -> Gaussian:
-        return Gaussian(mean=mlp.apply(params["mean"], obs), log_std=params["log_std"])
+        mean: jax.Array = mlp.apply(params["mean"], obs)  # type: ignore[assignment]  # flax: Any or a tuple
+        return Gaussian(mean=mean, log_std=params["log_std"])
 
     return Policy(init, apply)
 
@@ -68,6 +69,7 @@ def make_scalar(config: Config, input_dim: int, final_scale: float = 1.0) -> Net
         return mlp.init(key, jnp.zeros((1, input_dim)))
 
     def apply(params: PyTree, x: Float[Array, "... D"]) -> Float[Array, "..."]:
-        return mlp.apply(params, x)[..., 0]
+        values: jax.Array = mlp.apply(params, x)  # type: ignore[assignment]  # flax: Any or a tuple with collections
+        return values[..., 0]
 
     return Network(init, apply)

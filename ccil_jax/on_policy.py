@@ -1,5 +1,6 @@
 """The on-policy agent: Algorithms 1 and 2 of the paper as one iteration, for every row of `methods.METHODS`."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -86,9 +87,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             key=key,
         )
 
-    def generator_step(
-        state: AgentState, key: jax.Array
-    ) -> tuple[AgentState, tuple[Transition, PolicyStep, Metrics]]:
+    def generator_step(state: AgentState, key: jax.Array) -> tuple[AgentState, tuple[Transition, PolicyStep, Metrics]]:
         rollout_key, split_key, critic_key = jax.random.split(key, 3)
         rollout_state, transition = rollout.rollout(
             env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
@@ -113,7 +112,8 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             "reward_critic_loss": critic_losses[REWARD],
             "cost_critic_loss": critic_losses[COST],
         }
-        new = state.replace(
+        new = dataclasses.replace(
+            state,
             actor=Actor(policy_params=params, obs_statistics=statistics),
             critics=critics,
             rollout=rollout_state,
@@ -142,12 +142,19 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             "episode_length": state.estimates.episode_length,
             "cost_rate": cost_rate,
             "multiplier": constraint.multiplier(constraint_state),
-            "entropy": distributions.entropy(Gaussian(mean=jnp.zeros(()), log_std=state.actor.policy_params["log_std"])),
+            "entropy": distributions.entropy(
+                Gaussian(mean=jnp.zeros(()), log_std=state.actor.policy_params["log_std"])
+            ),
         }
         metrics |= {name: jnp.mean(value) for name, value in generator_metrics.items()}
         metrics["episodes_finished"] = jnp.sum(generator_metrics["episodes_finished"])
-        new = state.replace(
-            reward_model=reward_state, constraint=constraint_state, cost_rate=cost_rate, iteration=iteration, key=key
+        new = dataclasses.replace(
+            state,
+            reward_model=reward_state,
+            constraint=constraint_state,
+            cost_rate=cost_rate,
+            iteration=iteration,
+            key=key,
         )
         return new, metrics | reward_metrics | constraint_metrics
 
@@ -170,7 +177,7 @@ def estimate_episodes(previous: EpisodeEstimates, transition: Transition) -> tup
 
 
 def episodes_of_steps(transition: Transition, limit: jax.Array, max_episode_steps: int) -> Episodes:
-    """For every step the cost of its episode: known if it ends within the batch, else extrapolated at its rate so far."""
+    """The cost of each step's episode: known if it ends within the batch, else extrapolated at its rate so far."""
     rate = transition.episode_cost / transition.episode_length
     last = transition.done.at[-1].set(True)
     final = jnp.where(transition.done, transition.episode_cost, rate * max_episode_steps)

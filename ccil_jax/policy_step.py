@@ -102,6 +102,4 @@ def outer_problem(
         new_params = trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
         return importance(log_prob(new_params), log_prob(old_params))
 
-    return Outer(
-        reward_advantage=held_out.reward_advantage, cost=held_out.cost, importance_weights=importance_weights
-    )
+    return Outer(reward_advantage=held_out.reward_advantage, cost=held_out.cost, importance_weights=importance_weights)

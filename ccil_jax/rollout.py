@@ -1,5 +1,6 @@
 """Acting in vectorised environments. The only place that resets finished episodes."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -43,7 +44,7 @@ def init(env: Environment, num_envs: int, key: jax.Array) -> RolloutState:
     env_state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     offset = jnp.arange(num_envs, dtype=jnp.int32) * env.max_episode_steps // num_envs
     return RolloutState(
-        env_state=env_state.replace(step_count=env_state.step_count + offset),
+        env_state=dataclasses.replace(env_state, step_count=env_state.step_count + offset),
         episode_length=jnp.zeros(num_envs, jnp.int32),
         whole=offset == 0,
     )

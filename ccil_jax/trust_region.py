@@ -17,6 +17,8 @@ from ccil_jax.distributions import Gaussian
 from ccil_jax.types import Metrics
 
 Vectors = Float[Array, "R P"]
+Iterate = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # x, residual, direction, squared residual
+Search = tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]  # tries, candidate, gain, kl, accepted
 
 
 @struct.dataclass(kw_only=True)
@@ -39,8 +41,8 @@ def fisher_vector_product(
     num_samples = at.mean.shape[0]
 
     def product(vector: jax.Array) -> jax.Array:
-        tangent = distributions.fisher_product(at, push(vector))
-        (pulled,) = pull(tangent.replace(mean=tangent.mean / num_samples))
+        image = distributions.fisher_product(at, push(vector))
+        (pulled,) = pull(Gaussian(mean=image.mean / num_samples, log_std=image.log_std))
         return pulled + damping * vector
 
     return jax.vmap(product)
@@ -59,7 +61,7 @@ def conjugate_gradient(
     """
     target = tolerance * jnp.sum(b * b, axis=-1)
 
-    def iterate(carry: tuple[jax.Array, ...], _: None) -> tuple[tuple[jax.Array, ...], None]:
+    def iterate(carry: Iterate, _: None) -> tuple[Iterate, None]:
         x, residual, direction, squared = carry
         image = product(direction)
         curvature = jnp.sum(direction * image, axis=-1)
@@ -139,11 +141,11 @@ def step(
         finite = jnp.isfinite(gain) & jnp.isfinite(kl) & jnp.all(jnp.isfinite(candidate))
         return candidate, gain, kl, finite & (kl <= kl_tolerance * max_kl) & (gain >= 0)
 
-    def unfinished(carry: tuple[jax.Array, ...]) -> jax.Array:
+    def unfinished(carry: Search) -> jax.Array:
         index, _, _, _, accepted = carry
         return ~accepted & (index < num_halvings)
 
-    def shrink(carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    def shrink(carry: Search) -> Search:
         index = carry[0]
         return index + 1, *attempt(index)
 

@@ -14,7 +14,7 @@ import numpy as np
 from mujoco.batch import Batch as RawBatch
 
 import envs
-from ccil_jax import networks, policy_step, rollout, runner, running_statistics
+from ccil_jax import networks, policy_step, program, rollout, runner, running_statistics
 from ccil_jax.config import PRESETS, Config
 from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.methods import METHODS
@@ -135,7 +135,7 @@ def _rollout(config: Config, env: Any, setting: Setting) -> Work:
         return state, jnp.mean(transition.reward)
 
     def spread(function: Callable[..., Any]) -> Callable[..., Any]:  # over devices, as training does
-        mesh, spec = runner.seed_mesh(setting.num_seeds), jax.P("seeds")
+        mesh, spec = program.seed_mesh(setting.num_seeds), jax.P("seeds")
         return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
 
     keys = jax.random.split(jax.random.key(setting.seed), setting.num_seeds)
@@ -164,15 +164,15 @@ def _training(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
         episode_ends=np.arange(1000, num_steps + 1, 1000),
     )
     resolved = runner.resolve(config, env, expert)
-    program = runner.compile_program(resolved, env, runner.expert_data(expert), setting.num_seeds)
-    state = program.init(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
+    compiled = program.compile_program(resolved, env, runner.expert_data(expert), setting.num_seeds)
+    state = compiled.init(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
 
     def work() -> int:
         nonlocal state
-        state, _ = _wait(program.chunk(state))
-        return setting.num_seeds * program.chunk_length * config.steps_per_iteration
+        state, _ = _wait(compiled.chunk(state))
+        return setting.num_seeds * compiled.chunk_length * config.steps_per_iteration
 
-    return work, program.compile_seconds
+    return work, compiled.compile_seconds
 
 
 def _policy_steps(config: Config, env: Any, setting: Setting) -> tuple[Work, Work]:

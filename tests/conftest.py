@@ -7,10 +7,21 @@ import inspect
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")  # read when JAX is imported, here and in the tests' subprocesses
-os.environ.setdefault("MPLBACKEND", "agg")
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ccil_jax" / "tests"
+ENVIRONMENT = {  # read when the packages are imported, here and in the tests' subprocesses
+    "JAX_PLATFORMS": "cpu",
+    "MPLBACKEND": "agg",
+    # What is slow to compile is compiled once for all test processes and later runs. A limit of the size makes JAX
+    # lock the folder: without one, a process can read what another has half written.
+    "JAX_COMPILATION_CACHE_DIR": str(CACHE),
+    "JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
+}
+for variable, value in ENVIRONMENT.items():
+    os.environ.setdefault(variable, value)
 
 import beartype
 import jaxtyping

@@ -274,6 +274,6 @@ def same_bits(a: PyTree, b: PyTree) -> bool:
 
     (a_leaves, a_structure), (b_leaves, b_structure) = jax.tree.flatten(a), jax.tree.flatten(b)
     leaves = [(data(x), data(y)) for x, y in zip(a_leaves, b_leaves, strict=False)]
-    return bool(a_structure == b_structure) and all(
+    return str(a_structure) == str(b_structure) and all(
         x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in leaves
     )

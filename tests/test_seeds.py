@@ -11,7 +11,7 @@ import pytest
 
 from ccil_jax import runner
 from ccil_jax.on_policy import AgentState
-from ccil_jax.runner import Program
+from ccil_jax.program import Program, compile_program
 from ccil_jax.types import Metrics
 from envs.base import State
 from tests.probe_envs import Walk, same_bits, walk_config, walk_demonstrations
@@ -65,7 +65,7 @@ def compiled() -> Compiled:
     config = runner.resolve(walk_config(method="malm"), env, demonstrations)
     expert = runner.expert_data(demonstrations)
     jax.monitoring.register_event_duration_secs_listener(listener)
-    program = runner.compile_program(config, env, expert, NUM_SEEDS)
+    program = compile_program(config, env, expert, NUM_SEEDS)
     jax.monitoring.unregister_event_duration_listener(listener)
     return Compiled(program, listener.names, len(env.traces), env)
 

@@ -103,8 +103,8 @@ class NativePhysics:
 
     def _call(self, function: Callable[..., None], bits: jax.Array, ctrl: jax.Array) -> Data:
         shapes = (
-            jax.ShapeDtypeStruct((2 * self._row_size,), jnp.uint32),  # type: ignore[no-untyped-call]
-            jax.ShapeDtypeStruct((self._output_size,), jnp.result_type(float)),  # type: ignore[no-untyped-call]
+            jax.ShapeDtypeStruct((2 * self._row_size,), jnp.uint32),
+            jax.ShapeDtypeStruct((self._output_size,), jnp.result_type(float)),
         )
         bits, values = host_call(function, shapes, bits, ctrl)
 
