@@ -18,6 +18,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "activation": ("tanh", "relu", "swish"),
     "meta_gradient": ("full", "direct", "indirect", "none"),
     "multiplier_update": ("adam", "sgd"),
+    "meta_update": ("adam", "sgd"),
     "gate": ("batch", "episode"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
 }
@@ -53,6 +54,9 @@ class Config:
     activation: str = _static("tanh", "activation of every network (Table 1)")
     meta_gradient: str = _static("full", "outer step of malm: total derivative, one of its two parts, or none")
     multiplier_update: str = _static("adam", "dual step: adam on softplus(xi) (authors) or projected sgd (Algorithm 1)")
+    meta_update: str = _static(
+        "adam", "outer step: adam on the multiplier's parameter (authors) or sgd on lambda (line 16)"
+    )
     gate: str = _static("batch", "cvag: one decision per batch (Algorithm 2) or per episode (authors)")
     reward_form: str = _static(
         "softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)"

@@ -5,6 +5,7 @@ constraint chooses the weights (`combine`) and learns from the episode cost (`up
 mean cost of finished episodes less the limit.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -27,7 +28,8 @@ class Multiplier:
     """The Lagrange multiplier; `parameter` is xi with lambda = softplus(xi), or lambda itself."""
 
     parameter: jax.Array  # []
-    optimizer: PyTree
+    optimizer: PyTree  # of the dual step
+    outer_optimizer: PyTree  # of the outer step
 
 
 @struct.dataclass(kw_only=True)
@@ -77,13 +79,13 @@ def unconstrained(config: Config) -> Constraint:
 
 def lagrangian(config: Config) -> Constraint:
     """Reward less lambda times cost, lambda by dual ascent on the cost gap (Algorithm 1 line 14)."""
-    dual, read, _ = _dual_ascent(config)
+    multiplier = ascent(config)
     return Constraint(
-        init=lambda: _initial_multiplier(config),
-        multiplier=read,
+        init=multiplier.init,
+        multiplier=multiplier.read,
         gate=_no_gate,
         combine=lambda multiplier, cost_gap, gram: jnp.stack([jnp.ones_like(multiplier), -multiplier]),
-        update=lambda state, cost_gap, outer: (dual(state, cost_gap), {}),
+        update=lambda state, cost_gap, outer: (multiplier.dual(state, cost_gap), {}),
     )
 
 
@@ -92,15 +94,14 @@ def meta_lagrangian(config: Config) -> Constraint:
     inner = lagrangian(config)
     if config.meta_gradient == "none":
         return inner
-    _, read, write = _dual_ascent(config)
+    multiplier = ascent(config)
 
     def update(state: Multiplier, cost_gap: jax.Array, outer: Outer | None) -> tuple[Multiplier, Metrics]:
         assert outer is not None, "the meta-gradient needs held-out samples"
-        after_dual, _ = inner.update(state, cost_gap, None)
-        gradient = outer_gradient(config.meta_gradient, read(state), read(after_dual), outer)
+        after_dual = multiplier.dual(state, cost_gap)
+        gradient = outer_gradient(config.meta_gradient, multiplier.read(state), multiplier.read(after_dual), outer)
         gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
-        stepped = write(after_dual, read(after_dual) - config.meta_learning_rate * gradient)
-        return stepped, {"meta_gradient": gradient}
+        return multiplier.outer(after_dual, gradient), {"meta_gradient": gradient}
 
     return inner._replace(update=update)
 
@@ -155,52 +156,70 @@ def alternating(config: Config) -> Constraint:
     return plain._replace(combine=by_batch, entropy_in_cost=True)
 
 
-def _initial_multiplier(config: Config) -> Multiplier:
-    initial = jnp.asarray(config.initial_multiplier, jnp.result_type(float))
-    parameter = inverse_softplus(initial) if config.multiplier_update == "adam" else initial
-    return Multiplier(parameter=parameter, optimizer=optax.adam(1.0).init(parameter))
-
-
 def inverse_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
     """xi with softplus(xi) = value, for value >= SMALLEST_SOFTPLUS_MULTIPLIER (smaller values are raised to it)."""
     value = jnp.maximum(value, SMALLEST_SOFTPLUS_MULTIPLIER)
     return value + jnp.log(-jnp.expm1(-value))
 
 
-def _dual_ascent(
-    config: Config,
-) -> tuple[
-    Callable[[Multiplier, jax.Array], Multiplier],
-    Callable[[Multiplier], jax.Array],
-    Callable[[Multiplier, jax.Array], Multiplier],
-]:
-    """(dual step, read lambda, write lambda) of the configured parametrisation."""
-    optimizer = optax.adam(config.multiplier_learning_rate)
+class Ascent(NamedTuple):
+    """A parametrisation of the multiplier and its two steps."""
 
-    def clip(multiplier: jax.Array) -> jax.Array:
-        return jnp.clip(multiplier, 0.0, config.multiplier_max)
+    init: Callable[[], Multiplier]
+    read: Callable[[Multiplier], jax.Array]  # lambda, in [0, multiplier_max]
+    dual: Callable[[Multiplier, jax.Array], Multiplier]  # along the cost gap (Algorithm 1 line 14)
+    outer: Callable[[Multiplier, jax.Array], Multiplier]  # against dL/dlambda' (Algorithm 1 line 16)
 
-    def adam(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
+
+def ascent(config: Config) -> Ascent:
+    """The parametrisation `config.multiplier_update` and the outer step `config.meta_update`."""
+    parametrize = {"adam": softplus_parameter, "sgd": projected_parameter}[config.multiplier_update]
+    read, write = parametrize(config.multiplier_max)
+    optimizer, outer_optimizer = optax.adam(config.multiplier_learning_rate), optax.adam(config.meta_learning_rate)
+
+    def init() -> Multiplier:
+        parameter = write(jnp.asarray(config.initial_multiplier, jnp.result_type(float)))
+        return Multiplier(
+            parameter=parameter,
+            optimizer=optimizer.init(parameter),
+            outer_optimizer=outer_optimizer.init(parameter),
+        )
+
+    def moved(state: Multiplier, parameter: jax.Array, **optimizers: PyTree) -> Multiplier:
+        # Beyond the cap the parameter would only wind up.
+        parameter = jnp.minimum(parameter, config.multiplier_max)
+        return dataclasses.replace(state, parameter=parameter, **optimizers)
+
+    def dual(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
+        if config.multiplier_update == "sgd":
+            return moved(state, write(read(state) + config.multiplier_learning_rate * cost_gap))
         updates, optimizer_state = optimizer.update(-cost_gap, state.optimizer)
-        xi = state.parameter + jnp.asarray(updates)
-        # Beyond the cap xi would only wind up; softplus(xi) <= xi + log 2.
-        return Multiplier(parameter=jnp.minimum(xi, config.multiplier_max), optimizer=optimizer_state)
+        return moved(state, state.parameter + jnp.asarray(updates), optimizer=optimizer_state)
 
-    def sgd(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
-        return write(state, state.parameter + config.multiplier_learning_rate * cost_gap)
+    def outer(state: Multiplier, gradient: jax.Array) -> Multiplier:
+        if config.meta_update == "sgd":
+            return moved(state, write(read(state) - config.meta_learning_rate * gradient))
+        slope = jax.grad(lambda parameter: read(dataclasses.replace(state, parameter=parameter)))(state.parameter)
+        updates, optimizer_state = outer_optimizer.update(gradient * slope, state.outer_optimizer)
+        return moved(state, state.parameter + jnp.asarray(updates), outer_optimizer=optimizer_state)
 
-    def read_softplus(state: Multiplier) -> jax.Array:
-        return clip(jax.nn.softplus(state.parameter))
+    return Ascent(init, read, dual, outer)
 
-    def write_softplus(state: Multiplier, multiplier: jax.Array) -> Multiplier:
-        return Multiplier(parameter=inverse_softplus(clip(multiplier)), optimizer=state.optimizer)
 
-    def read(state: Multiplier) -> jax.Array:
-        return state.parameter
+Parameter = tuple[Callable[[Multiplier], jax.Array], Callable[[jax.Array], jax.Array]]  # read, write
 
-    def write(state: Multiplier, multiplier: jax.Array) -> Multiplier:
-        return Multiplier(parameter=clip(multiplier), optimizer=state.optimizer)
 
-    if config.multiplier_update == "adam":
-        return adam, read_softplus, write_softplus
-    return sgd, read, write
+def softplus_parameter(maximum: jax.Array | float) -> Parameter:
+    """lambda = softplus(parameter), capped at `maximum`."""
+    return (
+        lambda state: jnp.minimum(jax.nn.softplus(state.parameter), maximum),
+        lambda multiplier: inverse_softplus(jnp.minimum(multiplier, maximum)),
+    )
+
+
+def projected_parameter(maximum: jax.Array | float) -> Parameter:
+    """lambda = parameter, projected to [0, maximum] when written."""
+    return (
+        lambda state: jnp.clip(state.parameter, 0.0, maximum),
+        lambda multiplier: jnp.clip(multiplier, 0.0, maximum),
+    )

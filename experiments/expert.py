@@ -83,12 +83,13 @@ def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int
     return max(allowed, key=lambda row: row["episode_return"])["seed"] if allowed else None
 
 
-def record(plan: Plan, outcome: Outcome, seed: int, num_trajectories: int) -> Demonstrations:
+def record(outcome: Outcome, seed: int, num_trajectories: int) -> Demonstrations:
     """Rolls out the chosen seed's policy and adds what a reader of the file needs to know."""
     import jax
 
     from ccil_jax import evaluation
 
+    plan = outcome.plan
     actor = jax.tree.map(lambda leaf: leaf[seed], outcome.result.agent)
     row = outcome.summary["per_seed"][seed]
     facts = {
@@ -152,7 +153,7 @@ def run(arguments: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 1
-    demonstrations = record(plan, outcome, seed, arguments.num_trajectories)
+    demonstrations = record(outcome, seed, arguments.num_trajectories)
     save_demonstrations(arguments.out, demonstrations)
     print_demonstrations(demonstrations, arguments.out)
     return 0

@@ -53,6 +53,7 @@ class Plan:
 class Outcome:
     """A finished run: what was learnt and how it did."""
 
+    plan: Plan  # as carried out
     result: "Result"
     env: Any
     evaluation: "Evaluation"  # [num_seeds, num_episodes]
@@ -71,6 +72,9 @@ def execute(plan: Plan) -> Outcome:
         import envs  # with JAX behind it: not before the input has been checked
 
         env = envs.make(plan.task, physics=plan.physics, **plan.env_options)
+        # A resumed run was made by all its commands: the first, and those that continued it.
+        earlier = [run_folder.read_run(plan.folder).facts["command"]] if plan.resume else []
+        plan = dataclasses.replace(plan, command="\n".join([*earlier, plan.command]))
         run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
         result, rate = _train(plan, env, display)
         display.message(f"evaluating {plan.eval_episodes} episodes per seed ...")
@@ -81,7 +85,7 @@ def execute(plan: Plan) -> Outcome:
         )
         random = evaluation.random_policy(env, num_episodes=plan.eval_episodes, seed=plan.evaluation_seed)
     content = _finish(plan, result, rate, evaluated, random)
-    return Outcome(result=result, env=env, evaluation=evaluated, random=random, summary=content)
+    return Outcome(plan=plan, result=result, env=env, evaluation=evaluated, random=random, summary=content)
 
 
 def _train(plan: Plan, env: Any, display: Display) -> tuple["Result", float | None]:

@@ -10,6 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
+import beartype
+import jaxtyping
+from hypothesis import settings
+
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ccil_jax" / "tests"
 ENVIRONMENT = {  # read when the packages are imported, here and in the tests' subprocesses
     "JAX_PLATFORMS": "cpu",
@@ -20,12 +24,9 @@ ENVIRONMENT = {  # read when the packages are imported, here and in the tests' s
     "JAX_COMPILATION_CACHE_MAX_SIZE": str(2**30),
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
 }
+assert "jax" not in sys.modules, "imported too early to be set"
 for variable, value in ENVIRONMENT.items():
     os.environ.setdefault(variable, value)
-
-import beartype
-import jaxtyping
-from hypothesis import settings
 
 # The first call of a jitted function compiles, so no example has a deadline. The same examples on every run.
 settings.register_profile("tests", deadline=None, derandomize=True)

@@ -272,8 +272,7 @@ def same_bits(a: PyTree, b: PyTree) -> bool:
         is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
         return np.asarray(jax.random.key_data(x) if is_key else x)
 
-    (a_leaves, a_structure), (b_leaves, b_structure) = jax.tree.flatten(a), jax.tree.flatten(b)
-    leaves = [(data(x), data(y)) for x, y in zip(a_leaves, b_leaves, strict=False)]
-    return str(a_structure) == str(b_structure) and all(
-        x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in leaves
-    )
+    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
+        return False
+    leaves = [(data(x), data(y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)]
+    return all(x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in leaves)
