@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 from ccil_jax.config import Config
 from ccil_jax.types import Metrics, PyTree
 
-# The outer step may not push softplus(xi) lower: Adam moves xi by about its learning rate an update, and would need
-# hundreds of updates to come back.
+# Adam moves xi by about its learning rate an update, so after a long time within the limit a vanishing softplus(xi)
+# would need as long again to become felt: it stays at least this large.
 SMALLEST_SOFTPLUS_MULTIPLIER = 1e-3
 
 
@@ -186,8 +186,8 @@ def ascent(config: Config) -> Ascent:
         )
 
     def moved(state: Multiplier, parameter: jax.Array, **optimizers: PyTree) -> Multiplier:
-        # Beyond the cap the parameter would only wind up.
-        parameter = jnp.minimum(parameter, config.multiplier_max)
+        # Beyond either end it would only wind up, and take as many updates to come back.
+        parameter = jnp.clip(parameter, write(jnp.zeros(())), write(jnp.asarray(config.multiplier_max)))
         return dataclasses.replace(state, parameter=parameter, **optimizers)
 
     def dual(state: Multiplier, cost_gap: jax.Array) -> Multiplier:

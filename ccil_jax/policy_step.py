@@ -81,8 +81,10 @@ def improve(
         kl_tolerance=config.kl_tolerance,
         num_halvings=config.line_search_steps,
     )
+    # A rejected step replays as standing still, also where its directions were not finite (0 times NaN is NaN).
+    replayed = jax.tree.map(lambda leaf: jnp.where(fraction > 0, leaf, 0.0), directions)
     taken = PolicyStep(
-        policy_params=policy_params, directions=directions, fraction=fraction, cost_gap=cost_gap, held_out=held_out
+        policy_params=policy_params, directions=replayed, fraction=fraction, cost_gap=cost_gap, held_out=held_out
     )
     return unravel(new_params), taken, metrics
 

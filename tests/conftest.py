@@ -6,12 +6,13 @@ import importlib.machinery
 import inspect
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 
 import beartype
 import jaxtyping
+import pytest
 from hypothesis import settings
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ccil_jax" / "tests"
@@ -79,3 +80,12 @@ class CheckingFinder(importlib.abc.MetaPathFinder):
 
 assert not set(CHECKED) & set(sys.modules), "imported too early to be checked"
 sys.meta_path.insert(0, CheckingFinder())
+
+
+@pytest.fixture(scope="session", autouse=True)
+def outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests run where nothing of the checkout is near and stray files, such as MuJoCo's log, do no harm."""
+    checkout = Path.cwd()
+    os.chdir(tmp_path_factory.mktemp("elsewhere"))
+    yield
+    os.chdir(checkout)

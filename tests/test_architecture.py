@@ -38,6 +38,7 @@ ORDER = (
     "methods",
     "policy_step",
     "on_policy",
+    "program",
     "evaluation",
     "checkpointing",
     "runner",

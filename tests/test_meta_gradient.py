@@ -222,7 +222,13 @@ def test_direct_vanishes_at_its_least_squares_fixed_point_and_leads_there() -> N
     gradient = jax.jit(lambda after: constraints.outer_gradient("direct", after, after, constant_weights(5.0)))
     np.testing.assert_allclose(gradient(jnp.asarray(FIXED_POINT)), 0, atol=1e-6)
     assert gradient(jnp.asarray(FIXED_POINT - 0.1)) < 0 < gradient(jnp.asarray(FIXED_POINT + 0.1))
-    config = Config(meta_gradient="direct", multiplier_update="sgd", meta_learning_rate=0.2, initial_multiplier=0.0)
+    config = Config(
+        meta_gradient="direct",
+        multiplier_update="sgd",
+        meta_update="sgd",
+        meta_learning_rate=0.2,
+        initial_multiplier=0.0,
+    )
     constraint = constraints.meta_lagrangian(config)
     update = jax.jit(lambda state: constraint.update(state, jnp.zeros(()), constant_weights(5.0))[0])
     state: Multiplier = constraint.init()
@@ -236,7 +242,7 @@ def test_the_outer_step_follows_the_dual_step() -> None:
 
     lambda'' = 1.1 - 0.25 * 0.8 = 0.9.
     """
-    config = Config(meta_gradient="direct", multiplier_update="sgd", meta_learning_rate=0.25)
+    config = Config(meta_gradient="direct", multiplier_update="sgd", meta_update="sgd", meta_learning_rate=0.25)
     multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(1.0))
     np.testing.assert_allclose(metrics["meta_gradient"], 0.8, rtol=1e-5)
     np.testing.assert_allclose(multiplier, 0.9, rtol=1e-5)
@@ -250,13 +256,18 @@ def test_the_outer_step_follows_the_dual_step() -> None:
     np.testing.assert_allclose(multiplier, 1.1, rtol=1e-6)
 
 
-def test_adam_writes_the_outer_step_through_softplus() -> None:
-    config = Config(meta_gradient="direct", multiplier_update="adam", meta_learning_rate=0.25)
-    dual = float(np.log1p(np.exp(np.log(np.expm1(1.0)) + 0.05)))  # Adam's first step is its rate
+@pytest.mark.parametrize("step", ["adam", "sgd"])
+def test_both_outer_steps_go_through_softplus(step: str) -> None:
+    """From lambda 1 and gap 2. The gradient is positive, so Adam's first step lowers xi by its rate, 0.25."""
+    config = Config(meta_gradient="direct", multiplier_update="adam", meta_update=step, meta_learning_rate=0.25)
+    xi = np.log(np.expm1(1.0)) + 0.05  # after the dual step: Adam's first step is its rate
+    dual = np.log1p(np.exp(xi))
     gradient = -2 * np.mean(COST * (REWARD - dual * COST))
+    assert gradient > 0
     multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(1.0))
     np.testing.assert_allclose(metrics["meta_gradient"], gradient, rtol=1e-4)
-    np.testing.assert_allclose(multiplier, dual - 0.25 * gradient, rtol=1e-5)
+    expected = {"adam": np.log1p(np.exp(xi - 0.25)), "sgd": dual - 0.25 * gradient}[step]
+    np.testing.assert_allclose(multiplier, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("form", ["adam", "sgd"])
@@ -269,7 +280,7 @@ def test_the_outer_step_keeps_the_multiplier_within_its_bounds(form: str) -> Non
 
 @pytest.mark.parametrize("kind", ["full", "indirect"])
 def test_a_non_finite_outer_gradient_moves_nothing(kind: str) -> None:
-    config = Config(meta_gradient=kind, multiplier_update="sgd", meta_learning_rate=0.25)
+    config = Config(meta_gradient=kind, multiplier_update="sgd", meta_update="sgd", meta_learning_rate=0.25)
     multiplier, metrics = meta_step(config, 1.0, 2.0, constant_weights(np.nan))
     assert metrics["meta_gradient"] == 0
     np.testing.assert_allclose(multiplier, 1.1, rtol=1e-6)  # the dual step alone

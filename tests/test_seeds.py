@@ -9,12 +9,12 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax import runner
+from ccil_jax import on_policy, runner
 from ccil_jax.on_policy import AgentState
 from ccil_jax.program import Program, compile_program
 from ccil_jax.types import Metrics
 from envs.base import State
-from tests.probe_envs import Walk, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 NUM_SEEDS = 3
 
@@ -124,3 +124,14 @@ def test_a_program_is_two_functions_compiled_once_each(compiled: Compiled, compi
     compiled.program.init(keys)
     assert not compilations.names
     assert len(compiled.env.traces) == 1
+
+
+def test_every_random_key_is_consumed_once() -> None:
+    """JAX's own check, on keys within the program and on those that one iteration hands to the next."""
+    demonstrations = walk_demonstrations()
+    config = runner.resolve(walk_config(method="malm"), Walk(), demonstrations)
+    agent = on_policy.make(config, Walk(), runner.expert_data(demonstrations))
+    with jax.debug_key_reuse(True), quick_compilation():
+        state, step = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.step)
+        for _ in range(2):
+            state, _ = step(state)

@@ -134,6 +134,15 @@ def test_a_solved_right_hand_side_is_frozen_while_the_other_goes_on() -> None:
     assert np.all(np.isfinite(residual))
 
 
+def test_a_right_hand_side_is_frozen_once_its_squared_residual_is_within_the_tolerance() -> None:
+    """A = diag(2, 3): from b = (1, 1) the first step is 2/5 b and leaves (1/5, -1/5), 4% of |b|^2."""
+    product, b = matrix_product(np.diag([2.0, 3.0]).astype(np.float32)), jnp.array([[1.0, 1.0], [0.0, 1.0]])
+    x, _ = trust_region.conjugate_gradient(product, b, 10, tolerance=0.05)
+    np.testing.assert_allclose(x, [[0.4, 0.4], [0, 1 / 3]], rtol=1e-6)
+    x, _ = trust_region.conjugate_gradient(product, b, 10, tolerance=0.03)
+    np.testing.assert_allclose(x, [[1 / 2, 1 / 3], [0, 1 / 3]], rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("matrix", "b", "expected"),
     [
