@@ -7,9 +7,14 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from ccil_jax.config import ConfigError
 from ccil_jax.types import PyTree
 
 KEPT = 2  # newest checkpoints that stay on disk
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint that does not fit. The message names it and the likely reason."""
 
 
 class Checkpointer:
@@ -36,8 +41,18 @@ class Checkpointer:
         self._manager.save(step, args=ocp.args.StandardSave(state))
 
     def restore(self, step: int, like: PyTree) -> PyTree:
-        """The state saved at `step`; `like` gives structure, shapes, dtypes and shardings."""
-        return self._manager.restore(step, args=ocp.args.StandardRestore(like))
+        """The state saved at `step`; `like` gives structure, shapes, dtypes and shardings.
+
+        Raises:
+            CheckpointError: what was saved is something else, or damaged.
+        """
+        try:
+            return self._manager.restore(step, args=ocp.args.StandardRestore(like))
+        except (ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(
+                f"{self._manager.directory}/{step}: cannot be restored; it was damaged, or written under another "
+                f"configuration or version of ccil_jax ({str(error).splitlines()[0]})"
+            ) from error
 
     def structure(self, step: int) -> PyTree:
         """What was saved at `step`, as empty NumPy arrays of its shapes and dtypes."""
