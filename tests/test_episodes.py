@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import constraints, networks, on_policy, regression, rollout, running_statistics
+from ccil_jax import constraints, networks, on_policy, policy_step, regression, rollout, running_statistics
 from ccil_jax.config import Config
 from ccil_jax.on_policy import AgentState, EpisodeEstimates
 from ccil_jax.regression import Critic
 from ccil_jax.rollout import Actor, RolloutState
-from ccil_jax.types import Batch, Transition
-from tests.probe_envs import Counter, Probe, Walk
+from ccil_jax.types import Batch, PyTree, Transition
+from tests.probe_envs import Counter, Probe, Walk, quick_compilation, walk_config
 
 NUM_STEPS = 4  # of one batch
 COUNTER_CONFIG = Config(method="expert", cost_limit=12.5, num_envs=2, hidden_sizes=(2,), gamma=0.9, gae_lambda=0.5)
@@ -150,6 +150,30 @@ def test_episodes_begin_anew_at_random() -> None:
     assert (np.abs(starts) <= 1).all()
     assert steps.terminated.any()
     assert (steps.done & ~steps.terminated).any()
+
+
+def test_the_policy_step_sees_observations_normalised_as_when_the_actions_were_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With a deviation of e^-20 an action is the mean, so the policy must find it again in the batch it is given.
+
+    Statistics updated between acting and the policy step would shift the means, and so the old log-probabilities.
+    """
+
+    def improve(config: Config, apply: Any, constraint: Any, params: PyTree, batch: Batch, *_: Any) -> Any:
+        return params, (), {"shift": jnp.max(jnp.abs(apply(params, batch.obs).mean - batch.action))}
+
+    monkeypatch.setattr(policy_step, "improve", improve)
+    agent = on_policy.make(walk_config(method="trpo", cost_limit=0.0, generator_steps=3), Walk(), None)
+    with quick_compilation():
+        state = jax.jit(agent.init)(jax.random.key(0))
+        rng = np.random.default_rng(0)
+        params = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), state.actor.policy_params)
+        params["log_std"] = jnp.full(1, -20.0)
+        start = state.replace(actor=state.actor.replace(policy_params=params))
+        state, metrics = jax.jit(agent.step)(start)
+    assert metrics["shift"] < 1e-5
+    assert state.actor.obs_statistics.count == 3 * 32
 
 
 # Values --------------------------------------------------------------------------------------------------------------

@@ -278,6 +278,30 @@ def test_the_outer_step_keeps_the_multiplier_within_its_bounds(form: str) -> Non
     assert meta_step(config, 0.2, 0.0, constant_weights(1.0))[0] == 5.0
 
 
+def test_adams_outer_steps_descend_along_the_slope_of_softplus() -> None:
+    """Kingma and Ba's Adam, line by line, on xi with gradient dL/dlambda sigmoid(xi)."""
+    rate, gradients = 0.3, [2.0, -1.0, 0.5, 0.5]
+    multiplier = constraints.ascent(Config(initial_multiplier=0.5, meta_learning_rate=rate))
+    step, state = jax.jit(multiplier.outer), multiplier.init()
+    xi, m, v = np.log(np.expm1(0.5)), 0.0, 0.0
+    for t, gradient in enumerate(gradients, 1):
+        slope = gradient / (1 + np.exp(-xi))
+        m, v = 0.9 * m + 0.1 * slope, 0.999 * v + 0.001 * slope**2
+        xi -= rate * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-8)
+        state = step(state, jnp.asarray(gradient))
+        np.testing.assert_allclose(multiplier.read(state), np.log1p(np.exp(xi)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("form", ["adam", "sgd"])
+@pytest.mark.parametrize("maximum", [2.0, 3.3, 100.0])
+def test_adams_outer_step_leaves_the_cap_at_once(form: str, maximum: float) -> None:
+    """Where lambda is capped its slope must not vanish."""
+    config = Config(multiplier_update=form, multiplier_max=maximum, initial_multiplier=maximum, meta_learning_rate=0.1)
+    multiplier = constraints.ascent(config)
+    state = multiplier.outer(multiplier.init(), jnp.ones(()))
+    assert multiplier.read(state) < maximum - 0.05
+
+
 @pytest.mark.parametrize("kind", ["full", "indirect"])
 def test_a_non_finite_outer_gradient_moves_nothing(kind: str) -> None:
     config = Config(meta_gradient=kind, multiplier_update="sgd", meta_update="sgd", meta_learning_rate=0.25)

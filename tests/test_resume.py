@@ -29,7 +29,7 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
     half = train(tmp_path, stop_after=10)
     assert half.env_steps == whole.env_steps // 2 == 10 * 64
     assert not same_bits(half.state, whole.state)
-    # Every call compiles its program anew, as a new process would.
+    # Every call builds its program anew, as a new process would.
     resumed = train(tmp_path, resume=True)
     assert resumed.env_steps == whole.env_steps == 20 * 64
     assert same_bits(resumed.state, whole.state)
