@@ -130,7 +130,7 @@ def step(
 
     Returns:
         The first candidate that is finite, within the radius and no worse, or `params` bit for bit; its fraction (0 if
-        none); metrics `kl`, `surrogate` (the objective's improvement) and `step_fraction`.
+        none, or if the directions cancel); metrics `kl`, `surrogate` (the objective's improvement) and `step_fraction`.
     """
     before = weights @ evaluate(params)[0]
 
@@ -152,7 +152,8 @@ def step(
     zero = jnp.zeros((), params.dtype)
     start = (jnp.zeros((), jnp.int32), params, zero, zero, jnp.zeros((), bool))
     tried, candidate, gain, kl, accepted = jax.lax.while_loop(unfinished, shrink, start)
-    fraction = jnp.where(accepted, 0.5 ** (tried - 1.0), 0.0)
+    # Directions that cancel are accepted as a step of nothing: that counts as no step.
+    fraction = jnp.where(accepted & jnp.any(candidate != params), 0.5 ** (tried - 1.0), 0.0)
     metrics = {
         "kl": jnp.where(accepted, kl, 0.0),
         "surrogate": jnp.where(accepted, gain, 0.0),
