@@ -48,7 +48,12 @@ class Config:
     num_envs: int = _static(16, "simulations stepped side by side, per seed")
     batch_size: int = _static(2000, "environment steps per generator step, K (Table 1)")
     generator_steps: int = _static(3, "policy updates per iteration, each on a fresh batch (Table 1)")
-    discriminator_steps: int = _static(1, "discriminator updates per iteration (Table 1)")
+    discriminator_steps: int = _static(
+        1, "discriminator updates per iteration (Table 1), each a pass over the last batch in minibatches"
+    )
+    discriminator_minibatch_size: int = _static(
+        128, "samples of either class per discriminator gradient step; the authors take the whole batch at once"
+    )
     held_out_fraction: float = _static(0.3, "share of the batch kept for the outer loss, malm only (authors)")
     hidden_sizes: tuple[int, ...] = _static((100, 100), "hidden layers of policy, critics and discriminator (Table 1)")
     activation: str = _static("tanh", "activation of every network (Table 1)")
@@ -129,6 +134,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "env_steps": 1_500_000,
         "generator_steps": 1,
         "discriminator_steps": 3,
+        "discriminator_minibatch_size": 2000,
         "discriminator_learning_rate": 1e-3,
     },
     "tiny": {
@@ -136,6 +142,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "num_envs": 4,
         "batch_size": 40,
         "hidden_sizes": (8, 8),
+        "discriminator_minibatch_size": 20,
         "critic_minibatch_size": 10,
         "critic_epochs": 2,
     },
@@ -153,6 +160,7 @@ def validate(config: Config) -> None:
         "batch_size",
         "generator_steps",
         "discriminator_steps",
+        "discriminator_minibatch_size",
         "cg_iterations",
         "fisher_stride",
         "line_search_steps",
@@ -188,6 +196,11 @@ def validate(config: Config) -> None:
         raise ConfigError(
             f"--critic_minibatch_size {config.critic_minibatch_size} exceeds the {config.num_training} training "
             f"samples of a batch; use --critic_minibatch_size {config.num_training} or less"
+        )
+    if config.discriminator_minibatch_size > config.batch_size:
+        raise ConfigError(
+            f"--discriminator_minibatch_size {config.discriminator_minibatch_size} exceeds the batch; "
+            f"use --discriminator_minibatch_size {config.batch_size} or less"
         )
     if config.num_training < config.fisher_stride:
         raise ConfigError(f"--fisher_stride {config.fisher_stride} exceeds the {config.num_training} training samples")

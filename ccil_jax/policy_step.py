@@ -14,6 +14,7 @@ from ccil_jax import distributions, trust_region
 from ccil_jax.config import Config
 from ccil_jax.constraints import Constraint, Outer
 from ccil_jax.distributions import Gaussian
+from ccil_jax.shuffling import permutation
 from ccil_jax.trust_region import Directions
 from ccil_jax.types import Batch, Metrics, PyTree
 
@@ -32,7 +33,7 @@ class PolicyStep:
 def split(samples: Batch, num_held_out: int, key: jax.Array) -> tuple[Batch, Batch]:
     """A random partition into [V] held-out and [M] training samples (Algorithm 1 line 8); untouched if V is 0."""
     if num_held_out:
-        order = jnp.argsort(jax.random.bits(key, samples.cost.shape))
+        order = permutation(key, samples.cost.shape[0])
         samples = jax.tree.map(lambda x: x[order], samples)
     return jax.tree.map(lambda x: x[:num_held_out], samples), jax.tree.map(lambda x: x[num_held_out:], samples)
 

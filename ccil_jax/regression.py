@@ -8,6 +8,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
+from ccil_jax.shuffling import minibatches
 from ccil_jax.types import PyTree
 
 
@@ -41,13 +42,6 @@ def fit(
         The fitted critic, and the mean loss over the last epoch.
     """
     optimizer = optax.adam(learning_rate)
-    num_samples = obs.shape[0]
-    num_minibatches = num_samples // minibatch_size
-
-    def shuffle(key: jax.Array) -> jax.Array:
-        # One sort of random bits: half the cost of jax.random.permutation, whose second sort only breaks ties.
-        order = jnp.argsort(jax.random.bits(key, (num_samples,)))
-        return order[: num_minibatches * minibatch_size].reshape(num_minibatches, minibatch_size)
 
     def loss(params: PyTree, indices: jax.Array) -> jax.Array:
         return jnp.mean((apply(params, obs[indices]) - target[indices]) ** 2)
@@ -57,6 +51,6 @@ def fit(
         updates, optimizer_state = optimizer.update(gradient, critic.optimizer)
         return Critic(params=optax.apply_updates(critic.params, updates), optimizer=optimizer_state), value
 
-    indices = jax.vmap(shuffle)(jax.random.split(key, num_epochs))
-    critic, losses = jax.lax.scan(descend, critic, indices.reshape(-1, minibatch_size))
-    return critic, jnp.mean(losses[-num_minibatches:])
+    epochs = [minibatches(key, obs.shape[0], minibatch_size) for key in jax.random.split(key, num_epochs)]
+    critic, losses = jax.lax.scan(descend, critic, jnp.concatenate(epochs))
+    return critic, jnp.mean(losses[-len(epochs[-1]) :])

@@ -17,6 +17,7 @@ from ccil_jax import running_statistics
 from ccil_jax.config import Config
 from ccil_jax.networks import Network
 from ccil_jax.running_statistics import RunningStatistics
+from ccil_jax.shuffling import minibatches
 from ccil_jax.types import ExpertData, Metrics, PyTree, Transition
 
 
@@ -102,7 +103,6 @@ def discriminator(
 
         (value, (on_expert, on_learner)), gradient = jax.value_and_grad(loss, has_aux=True)(state.params)
         updates, optimizer_state = optimizer.update(gradient, state.optimizer)
-        held_out = logits(state.params, statistics, expert.held_out_obs, expert.held_out_action)
         new = Discriminator(
             params=optax.apply_updates(state.params, updates), optimizer=optimizer_state, statistics=statistics
         )
@@ -110,15 +110,25 @@ def discriminator(
             "discriminator_loss": value,
             "discriminator_accuracy_expert": jnp.mean(on_expert > 0),
             "discriminator_accuracy_learner": jnp.mean(on_learner < 0),
-            "discriminator_accuracy_held_out": jnp.mean(held_out > 0),
         }
 
     def update(state: Discriminator, transition: Transition, key: jax.Array) -> tuple[Discriminator, Metrics]:
         learner = jax.tree.map(
             lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, jnp.clip(transition.action, *action_bounds))
         )
-        keys = jax.random.split(key, config.discriminator_steps)
-        state, metrics = jax.lax.scan(lambda state, key: descend(state, learner, key), state, keys)
-        return state, jax.tree.map(lambda x: x[-1], metrics)
+        order_key, expert_key = jax.random.split(key)
+        epochs = [
+            minibatches(key, len(learner[0]), config.discriminator_minibatch_size)
+            for key in jax.random.split(order_key, config.discriminator_steps)
+        ]
+        indices = jnp.concatenate(epochs)
+
+        def step(state: Discriminator, inputs: tuple[jax.Array, jax.Array]) -> tuple[Discriminator, Metrics]:
+            indices, key = inputs
+            return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
+
+        state, metrics = jax.lax.scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
+        held_out = logits(state.params, state.statistics, expert.held_out_obs, expert.held_out_action)
+        return state, jax.tree.map(jnp.mean, metrics) | {"discriminator_accuracy_held_out": jnp.mean(held_out > 0)}
 
     return RewardModel(init, reward, update)

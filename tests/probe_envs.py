@@ -201,6 +201,7 @@ def walk_config(**changes: Any) -> Config:
         batch_size=32,
         generator_steps=2,
         hidden_sizes=(4,),
+        discriminator_minibatch_size=16,
         critic_minibatch_size=8,
         critic_epochs=2,
         fisher_stride=2,

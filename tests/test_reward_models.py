@@ -50,7 +50,9 @@ def expert_data() -> ExpertData:
 
 
 def make(expert: ExpertData, **changes: Any) -> RewardModel:
-    config = Config(hidden_sizes=(8,), discriminator_learning_rate=0.03).replace(**changes)
+    config = Config(
+        hidden_sizes=(8,), discriminator_learning_rate=0.03, batch_size=64, discriminator_minibatch_size=64
+    ).replace(**changes)
     network = networks.make_scalar(config, 4)
     return reward_models.discriminator(config, network, expert, (jnp.asarray(LOW), jnp.asarray(HIGH)), 2)
 
