@@ -197,7 +197,7 @@ def validate(config: Config) -> None:
             f"--critic_minibatch_size {config.critic_minibatch_size} exceeds the {config.num_training} training "
             f"samples of a batch; use --critic_minibatch_size {config.num_training} or less"
         )
-    if config.discriminator_minibatch_size > config.batch_size:
+    if config.method in IMITATION_METHODS and config.discriminator_minibatch_size > config.batch_size:
         raise ConfigError(
             f"--discriminator_minibatch_size {config.discriminator_minibatch_size} exceeds the batch; "
             f"use --discriminator_minibatch_size {config.batch_size} or less"

@@ -16,7 +16,11 @@ ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
 
 
 class MLP(nn.Module):
-    """Fully connected network; `final_scale` shrinks the initial last layer."""
+    """Fully connected network; `final_scale` shrinks the initial last layer.
+
+    Initial weights are Glorot and Bengio's (2010), for tanh. Not orthogonal ones: their batched QR kernel on the CPU
+    waits for helpers from the very threads it occupies, and hangs where seeds outnumber threads (jaxlib 0.10).
+    """
 
     sizes: Sequence[int]
     activation: Callable[[jax.Array], jax.Array]
@@ -25,8 +29,12 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         for size in self.sizes[:-1]:
-            x = self.activation(nn.Dense(size, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
-        return nn.Dense(self.sizes[-1], kernel_init=nn.initializers.orthogonal(self.final_scale))(x)
+            x = self.activation(nn.Dense(size, kernel_init=_glorot(1.0))(x))
+        return nn.Dense(self.sizes[-1], kernel_init=_glorot(self.final_scale))(x)
+
+
+def _glorot(scale: float) -> jax.nn.initializers.Initializer:
+    return nn.initializers.variance_scaling(scale**2, "fan_avg", "uniform")
 
 
 class Network(NamedTuple):

@@ -188,6 +188,14 @@ def test_its_statistics_hold_expert_and_learner_samples_in_equal_numbers() -> No
     np.testing.assert_allclose(state.statistics.mean, np.full(2, (112 * 1 - 64 * 5) / 176), atol=0.3)
 
 
+def test_an_update_is_a_pass_in_minibatches() -> None:
+    model = make(expert_data(), discriminator_steps=2, discriminator_minibatch_size=20)
+    state, metrics = model.update(start(), transition(*samples(-1.0, seed=1)), jax.random.key(0))
+    assert state.optimizer[0].count == 2 * 3  # 64 samples: three minibatches and 4 samples left over
+    assert state.statistics.count == 48 + 2 * 3 * (20 + 20)
+    assert np.isfinite(metrics["discriminator_loss"])
+
+
 def test_held_out_samples_are_never_trained_on() -> None:
     steps, expert = transition(*samples(-1.0, seed=1)), expert_data()
     other = expert.replace(held_out_obs=expert.held_out_obs - 9, held_out_action=expert.held_out_action - 9)
