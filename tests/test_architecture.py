@@ -28,6 +28,7 @@ ORDER = (
     "distributions",
     "networks",
     "running_statistics",
+    "shuffling",
     "returns",
     "demonstrations",
     "rollout",

@@ -135,3 +135,14 @@ def test_every_random_key_is_consumed_once() -> None:
         state, step = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.step)
         for _ in range(2):
             state, _ = step(state)
+
+
+def test_no_seed_waits_for_anothers_thread() -> None:
+    """Batched LAPACK kernels on the CPU wait for helpers from the pool that they occupy; with few threads, for ever."""
+    config, env = walk_config(method="malm", cost_limit=1.0), Walk()
+    expert = runner.expert_data(walk_demonstrations())
+    agent = on_policy.make(config, env, expert)
+    init = str(jax.make_jaxpr(jax.vmap(agent.init))(jax.random.split(jax.random.key(0), 2)))
+    step = str(jax.make_jaxpr(agent.step)(jax.eval_shape(agent.init, jax.random.key(0))))
+    for kernel in ("geqrf", "householder_product", "qr[", "svd[", "eigh[", "cholesky[", "lu["):
+        assert kernel not in init + step
