@@ -34,8 +34,8 @@ def seed_mesh(num_seeds: int) -> jax.sharding.Mesh:
     """The local devices that share the seeds evenly: as many as divide their number."""
     devices = jax.local_devices()
     if devices[0].platform == "cpu":
-        # Each CPU device's program holds a thread of XLA's pool and waits there for work that the pool does: one must
-        # stay free, or all wait for ever. XLA reads the pool's size from this variable too.
+        # A LAPACK kernel (MJX factorises with them) waits, in a thread of XLA's pool, for helpers from that pool: one
+        # thread must stay free, or all wait for ever. XLA reads the pool's size from this variable too.
         num_threads = int(os.environ.get("PJRT_NPROC") or os.cpu_count() or 1)
         devices = devices[: max(1, num_threads - 1)]
     size = max(n for n in range(1, len(devices) + 1) if num_seeds % n == 0)
