@@ -21,6 +21,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "meta_update": ("adam", "sgd"),
     "gate": ("batch", "episode"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
+    "discriminator_regularizer": ("none", "gradient_penalty"),
 }
 
 
@@ -66,6 +67,7 @@ class Config:
     reward_form: str = _static(
         "softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)"
     )
+    discriminator_regularizer: str = _static("gradient_penalty", "what keeps the discriminator smooth")
     cg_iterations: int = _static(10, "conjugate-gradient iterations (authors)")
     fisher_stride: int = _static(5, "the Fisher product uses every n-th sample (authors)")
     line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
@@ -83,6 +85,7 @@ class Config:
     discriminator_learning_rate: float = _traced(3e-4, "Adam (Table 1)")
     policy_entropy_coefficient: float = _traced(0.0, "beta, weight of the policy's entropy (Table 1)")
     discriminator_entropy_coefficient: float = _traced(1e-3, "weight of the discriminator's entropy bonus (Table 1)")
+    gradient_penalty_coefficient: float = _traced(1.0, "weight of the gradient penalty")
     initial_multiplier: float = _traced(0.01, "lambda before the first iteration (Table 1)")
     multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)")
     meta_learning_rate: float = _traced(0.05, "outer step size, malm only (Table 1)")
@@ -135,6 +138,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "generator_steps": 1,
         "discriminator_steps": 3,
         "discriminator_minibatch_size": 2000,
+        "discriminator_regularizer": "none",
         "discriminator_learning_rate": 1e-3,
     },
     "tiny": {

@@ -65,8 +65,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
         assert expert is not None, f"{config.method} learns from demonstrations"
         # A small last layer: an untrained discriminator must not reward anything in particular.
         network = networks.make_scalar(config, env.obs_dim + env.action_dim, final_scale=0.01)
-        bounds = (jnp.asarray(env.action_low), jnp.asarray(env.action_high))
-        reward_model = reward_models.discriminator(config, network, expert, bounds, env.obs_dim)
+        reward_model = reward_models.discriminator(config, network, expert, env.obs_dim)
     else:
         reward_model = reward_models.task()
     limit = jnp.asarray(config.cost_limit, jnp.result_type(float))

@@ -4,6 +4,7 @@ Sign convention, stated once: logits h are high on the expert. The paper's D ten
 h = -logit(D) and its reward -log D is softplus(h): an expert-like learner earns more.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -64,19 +65,33 @@ def classification_loss(
     return loss - entropy_coefficient * entropy
 
 
-def discriminator(
-    config: Config, network: Network, expert: ExpertData, action_bounds: tuple[jax.Array, jax.Array], obs_dim: int
-) -> RewardModel:
+def gradient_penalty(
+    logits: Callable[[jax.Array], jax.Array],
+    expert_inputs: Float[Array, "M D"],
+    learner_inputs: Float[Array, "M D"],
+    key: jax.Array,
+) -> Float[Array, ""]:
+    """Mean (|d logits / d input| - 1)^2 between random expert and learner inputs (Gulrajani et al. 2017).
+
+    It keeps the logits from growing steep where the classes part, so that the reward still tells a learner which way
+    the expert lies when none of its samples is taken for one.
+    """
+    mix = jax.random.uniform(key, (expert_inputs.shape[0], 1))
+    slopes = jax.vmap(jax.grad(logits))(mix * expert_inputs + (1 - mix) * learner_inputs)
+    # The small term: a vanishing slope must not have a NaN derivative.
+    return jnp.mean((jnp.sqrt(jnp.sum(slopes**2, axis=-1) + 1e-12) - 1) ** 2)
+
+
+def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim: int) -> RewardModel:
     """The adversarial reward of GAIL (Ho and Ermon 2016).
 
-    Learner actions are clipped to `action_bounds` first, as the environment executes them and as demonstrations record
-    them: otherwise the tail of the Gaussian alone would give the learner away.
+    It judges the learner's actions as they were sampled. Once clipped as the environment executes them, all actions
+    beyond the range would earn alike, and a policy whose mean has left the range would have no way back.
     """
     optimizer = optax.adam(config.discriminator_learning_rate)
 
-    def logits(params: PyTree, statistics: RunningStatistics, obs: jax.Array, action: jax.Array) -> jax.Array:
-        inputs = [running_statistics.normalize(statistics, obs), jnp.clip(action, *action_bounds)]
-        return network.apply(params, jnp.concatenate(inputs, axis=-1))
+    def inputs(statistics: RunningStatistics, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.concatenate([running_statistics.normalize(statistics, obs), action], axis=-1)
 
     def init(key: jax.Array) -> Discriminator:
         params = network.init(key)
@@ -84,21 +99,25 @@ def discriminator(
         return Discriminator(params=params, optimizer=optimizer.init(params), statistics=statistics)
 
     def reward(state: Discriminator, transition: Transition) -> jax.Array:
-        return REWARD_FORMS[config.reward_form](
-            logits(state.params, state.statistics, transition.obs, transition.action)
-        )
+        logits = network.apply(state.params, inputs(state.statistics, transition.obs, transition.action))
+        return REWARD_FORMS[config.reward_form](logits)
 
     def descend(
         state: Discriminator, learner: tuple[jax.Array, jax.Array], key: jax.Array
     ) -> tuple[Discriminator, Metrics]:
-        indices = jax.random.randint(key, (learner[0].shape[0],), 0, expert.obs.shape[0])
+        choice_key, penalty_key = jax.random.split(key)
+        indices = jax.random.randint(choice_key, (learner[0].shape[0],), 0, expert.obs.shape[0])
         expert_obs, expert_action = expert.obs[indices], expert.action[indices]
         statistics = running_statistics.update(state.statistics, jnp.concatenate([learner[0], expert_obs]))
+        expert_inputs, learner_inputs = inputs(statistics, expert_obs, expert_action), inputs(statistics, *learner)
 
         def loss(params: PyTree) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-            on_expert = logits(params, statistics, expert_obs, expert_action)
-            on_learner = logits(params, statistics, *learner)
+            logits = functools.partial(network.apply, params)
+            on_expert, on_learner = logits(expert_inputs), logits(learner_inputs)
             value = classification_loss(on_expert, on_learner, config.discriminator_entropy_coefficient)
+            if config.discriminator_regularizer == "gradient_penalty":
+                penalty = gradient_penalty(logits, expert_inputs, learner_inputs, penalty_key)
+                value = value + config.gradient_penalty_coefficient * penalty
             return value, (on_expert, on_learner)
 
         (value, (on_expert, on_learner)), gradient = jax.value_and_grad(loss, has_aux=True)(state.params)
@@ -113,9 +132,7 @@ def discriminator(
         }
 
     def update(state: Discriminator, transition: Transition, key: jax.Array) -> tuple[Discriminator, Metrics]:
-        learner = jax.tree.map(
-            lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, jnp.clip(transition.action, *action_bounds))
-        )
+        learner = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, transition.action))
         order_key, expert_key = jax.random.split(key)
         epochs = [
             minibatches(key, len(learner[0]), config.discriminator_minibatch_size)
@@ -128,7 +145,7 @@ def discriminator(
             return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
 
         state, metrics = jax.lax.scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
-        held_out = logits(state.params, state.statistics, expert.held_out_obs, expert.held_out_action)
+        held_out = network.apply(state.params, inputs(state.statistics, expert.held_out_obs, expert.held_out_action))
         return state, jax.tree.map(jnp.mean, metrics) | {"discriminator_accuracy_held_out": jnp.mean(held_out > 0)}
 
     return RewardModel(init, reward, update)

@@ -54,7 +54,7 @@ def make(expert: ExpertData, **changes: Any) -> RewardModel:
         hidden_sizes=(8,), discriminator_learning_rate=0.03, batch_size=64, discriminator_minibatch_size=64
     ).replace(**changes)
     network = networks.make_scalar(config, 4)
-    return reward_models.discriminator(config, network, expert, (jnp.asarray(LOW), jnp.asarray(HIGH)), 2)
+    return reward_models.discriminator(config, network, expert, 2)
 
 
 @functools.cache
@@ -116,6 +116,49 @@ def test_a_table_of_logits_converges_to_the_density_ratio() -> None:
     np.testing.assert_allclose(value, 2 * math.log(2) - 2 * divergence, rtol=1e-9)
 
 
+def test_the_gradient_penalty_typed_by_hand() -> None:
+    key, rng = jax.random.key(0), np.random.default_rng(0)
+    one, two = (jnp.asarray(rng.normal(size=(6, 2)), jnp.float32) for _ in range(2))
+    # The slope of a plane is the same everywhere: |(3, 4)| = 5.
+    plane = reward_models.gradient_penalty(lambda x: x @ jnp.array([3.0, 4.0]), one, two, key)
+    np.testing.assert_allclose(plane, (5 - 1) ** 2, rtol=1e-6)
+    # Between a point and itself there is only that point; the slope of |x|^2 / 2 is x.
+    bowl = reward_models.gradient_penalty(lambda x: jnp.sum(x**2, axis=-1) / 2, one, one, key)
+    np.testing.assert_allclose(bowl, np.mean((np.linalg.norm(one, axis=1) - 1) ** 2), rtol=1e-5)
+    # Between (0, 0) and (c, c) lies the diagonal, on which (x_0 - x_1)^2 is flat.
+    diagonal = jnp.broadcast_to(one[:, :1], (6, 2))
+    flat = reward_models.gradient_penalty(lambda x: (x[..., 0] - x[..., 1]) ** 2, 0 * one, diagonal, key)
+    np.testing.assert_allclose(flat, 1, rtol=1e-5)
+
+
+def test_the_gradient_penalty_of_a_flat_function_has_a_finite_gradient() -> None:
+    ones = jnp.ones((3, 2))
+
+    def penalty(scale: jax.Array) -> jax.Array:
+        return reward_models.gradient_penalty(lambda x: scale * x.sum(axis=-1), ones, -ones, jax.random.key(0))
+
+    assert np.isfinite(jax.grad(penalty)(jnp.zeros(())))
+
+
+def test_the_gradient_penalty_draws_the_slope_to_one() -> None:
+    expert, steps = expert_data(), transition(*samples(-1.0, seed=1))
+    slopes = {}
+    for regularizer in CHOICES["discriminator_regularizer"]:
+        model = make(expert, discriminator_regularizer=regularizer, gradient_penalty_coefficient=100.0)
+        state, key = start(), jax.random.key(1)
+        update = jax.jit(model.update)
+        for _ in range(40):
+            state, _ = update(state, steps, key)
+        reward = jax.jit(make(expert, reward_form="logit").reward)
+
+        def total(obs: jax.Array, state: Discriminator = state, reward: Any = reward) -> jax.Array:
+            return reward(state, steps.replace(obs=obs)).sum()
+
+        slopes[regularizer] = np.linalg.norm(jax.grad(total)(steps.obs), axis=-1).mean()
+    assert slopes["gradient_penalty"] < 1.2
+    assert slopes["gradient_penalty"] < slopes["none"] / 1.5
+
+
 # The reward ----------------------------------------------------------------------------------------------------------
 
 
@@ -158,16 +201,18 @@ def test_the_tasks_reward_is_the_environments() -> None:
 # What it is shown ----------------------------------------------------------------------------------------------------
 
 
-def test_learner_actions_are_seen_as_the_environment_executes_them() -> None:
-    """Beyond the bounds nothing changes: neither the reward nor what the discriminator learns."""
+def test_learner_actions_are_seen_as_they_were_sampled() -> None:
+    """An action further beyond the range is judged anew, so that a policy out there is led back."""
     obs, action = samples(-1.0, seed=1)
-    action[0, 0], action[1, 1] = [9.0, -9.0], [-1.5, 2.5]
-    clipped = np.clip(action, LOW, HIGH)
-    raw, executed, inside = (
-        advance(start(), transition(obs, a), expert_data(), jax.random.key(0)) for a in (action, clipped, clipped / 2)
+    further = action.copy()
+    action[0, 0], further[0, 0] = [1.5, -1.5], [9.0, -9.0]
+    (one, _, _), (two, _, _) = (
+        advance(trained()[0], transition(obs, a), expert_data(), jax.random.key(0)) for a in (action, further)
     )
-    assert same_bits(raw, executed)
-    assert not same_bits(raw, inside)
+    assert one[0, 0] != two[0, 0]
+    assert same_bits(one[1:], two[1:])
+    gradient = jax.grad(lambda a: make(expert_data()).reward(trained()[0], transition(obs, a)).sum())(further)
+    assert np.all(np.linalg.norm(gradient, axis=-1) > 0)
 
 
 def test_the_reward_is_that_of_the_moments_discriminator() -> None:
