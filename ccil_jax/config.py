@@ -134,15 +134,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # two went round in circles), hence minibatches; without a penalty the discriminator then wins outright where the
     # classes part easily (HalfCheetah). The README has the measurements.
     "paper": {},
-    # One policy step for three faster discriminator steps.
-    "default": {
-        "env_steps": 1_500_000,
-        "generator_steps": 1,
-        "discriminator_steps": 3,
-        "discriminator_minibatch_size": 2000,
-        "discriminator_regularizer": "none",
-        "discriminator_learning_rate": 1e-3,
-    },
+    "default": {"env_steps": 1_500_000},
     "tiny": {
         "env_steps": 240,
         "num_envs": 4,
