@@ -51,6 +51,6 @@ def fit(
         updates, optimizer_state = optimizer.update(gradient, critic.optimizer)
         return Critic(params=optax.apply_updates(critic.params, updates), optimizer=optimizer_state), value
 
-    epochs = [minibatches(key, obs.shape[0], minibatch_size) for key in jax.random.split(key, num_epochs)]
-    critic, losses = jax.lax.scan(descend, critic, jnp.concatenate(epochs))
-    return critic, jnp.mean(losses[-len(epochs[-1]) :])
+    indices = minibatches(key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=num_epochs)
+    critic, losses = jax.lax.scan(descend, critic, indices)
+    return critic, jnp.mean(losses.reshape(num_epochs, -1)[-1])

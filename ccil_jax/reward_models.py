@@ -134,14 +134,15 @@ def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim:
     def update(state: Discriminator, transition: Transition, key: jax.Array) -> tuple[Discriminator, Metrics]:
         learner = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, transition.action))
         order_key, expert_key = jax.random.split(key)
-        epochs = [
-            minibatches(key, len(learner[0]), config.discriminator_minibatch_size)
-            for key in jax.random.split(order_key, config.discriminator_steps)
-        ]
-        indices = jnp.concatenate(epochs)
+        indices = minibatches(
+            order_key,
+            len(learner[0]),
+            minibatch_size=config.discriminator_minibatch_size,
+            num_epochs=config.discriminator_steps,
+        )
 
-        def step(state: Discriminator, inputs: tuple[jax.Array, jax.Array]) -> tuple[Discriminator, Metrics]:
-            indices, key = inputs
+        def step(state: Discriminator, minibatch: tuple[jax.Array, jax.Array]) -> tuple[Discriminator, Metrics]:
+            indices, key = minibatch
             return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
 
         state, metrics = jax.lax.scan(step, state, (indices, jax.random.split(expert_key, len(indices))))

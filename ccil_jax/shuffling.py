@@ -13,7 +13,11 @@ def permutation(key: jax.Array, num_samples: int) -> Int[Array, " M"]:
     return jnp.argsort(jax.random.bits(key, (num_samples,)))
 
 
-def minibatches(key: jax.Array, num_samples: int, minibatch_size: int) -> Int[Array, "B M"]:
-    """Indices of one epoch in a random order, [B, minibatch_size]; the last partial batch is dropped."""
-    num_minibatches = num_samples // minibatch_size
-    return permutation(key, num_samples)[: num_minibatches * minibatch_size].reshape(num_minibatches, minibatch_size)
+def minibatches(key: jax.Array, num_samples: int, *, minibatch_size: int, num_epochs: int) -> Int[Array, "B M"]:
+    """Indices of the minibatches of `num_epochs` passes, each in a random order of its own, [B, minibatch_size].
+
+    The last partial batch of each pass is dropped. The key is consumed.
+    """
+    used = num_samples // minibatch_size * minibatch_size
+    orders = jax.vmap(lambda key: permutation(key, num_samples)[:used])(jax.random.split(key, num_epochs))
+    return orders.reshape(-1, minibatch_size)

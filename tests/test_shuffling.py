@@ -19,8 +19,16 @@ def test_every_first_index_is_about_as_likely() -> None:
     np.testing.assert_allclose(np.bincount(np.asarray(first)) / 4000, 0.25, atol=0.03)  # four standard errors
 
 
-def test_minibatches_share_no_sample_and_drop_the_rest() -> None:
-    batches = np.asarray(shuffling.minibatches(jax.random.key(0), 11, 3))
+def test_minibatches_of_a_pass_share_no_sample_and_drop_the_rest() -> None:
+    batches = np.asarray(shuffling.minibatches(jax.random.key(0), 11, minibatch_size=3, num_epochs=1))
     assert batches.shape == (3, 3)
     assert len(np.unique(batches)) == 9
     assert set(batches.flat) <= set(range(11))
+
+
+def test_every_pass_has_an_order_of_its_own() -> None:
+    batches = np.asarray(shuffling.minibatches(jax.random.key(0), 12, minibatch_size=4, num_epochs=2))
+    one, two = batches.reshape(2, 12)
+    for order in (one, two):
+        np.testing.assert_array_equal(np.sort(order), np.arange(12))
+    assert (one != two).any()
