@@ -5,7 +5,7 @@ import base64
 import dataclasses
 import html
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,9 @@ def make_parser() -> Parser:
         "--out", type=Path, metavar="FILE.html", help="page to write (default: report.html in the only run, or here)"
     )
     parser.add_argument(
+        "--figures", type=Path, metavar="DIR", help="also write each task's curves there, DIR/<task>.png"
+    )
+    parser.add_argument(
         "--seed", default=0, type=command_line.natural, metavar="N", help="of the bootstrap (default: 0)"
     )
     parser.add_argument(
@@ -95,9 +98,25 @@ def read_entries(folders: Sequence[Path]) -> list[Entry]:
     ]
 
 
-def page(entries: Sequence[Entry], *, seed: int = 0, player: Callable[[Entry], str] | None = None) -> str:
-    """The whole page; `player` gives the HTML of an episode of a run, or an empty string."""
-    tasks = list(dict.fromkeys(e.task for e in entries))
+def draw_tasks(entries: Sequence[Entry]) -> dict[str, bytes]:
+    """The learning curves of each task, all runs overlaid: bytes of a PNG file by task, in the order of the runs."""
+    from experiments import figures  # imports matplotlib
+
+    curves: dict[str, list[figures.Curve]] = {}
+    for e in entries:
+        curves.setdefault(e.task, []).append(figures.read_curve(e.run.folder, e.label))
+    return {task: figures.png(figures.draw_panels(drawn, task)) for task, drawn in curves.items()}
+
+
+def page(
+    entries: Sequence[Entry],
+    images: Mapping[str, bytes],
+    *,
+    seed: int = 0,
+    player: Callable[[Entry], str] | None = None,
+) -> str:
+    """The whole page, with a PNG for each task; `player` gives the HTML of an episode of a run, or an empty string."""
+    tasks = list(images)
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width, initial-scale=1'>",
@@ -109,20 +128,17 @@ def page(entries: Sequence[Entry], *, seed: int = 0, player: Callable[[Entry], s
     if len(tasks) > 1:
         parts.append(_across_tasks(entries, seed))
     for task in tasks:
-        parts += _task_section(task, [e for e in entries if e.task == task], seed, player)
+        parts += _task_section(task, [e for e in entries if e.task == task], images[task], seed, player)
     return "\n".join([*parts, "</body></html>\n"])
 
 
 def _task_section(
-    task: str, entries: Sequence[Entry], seed: int, player: Callable[[Entry], str] | None
+    task: str, entries: Sequence[Entry], image: bytes, seed: int, player: Callable[[Entry], str] | None
 ) -> Iterable[str]:
-    from experiments import figures  # imports matplotlib
-
-    curves = [figures.read_curve(e.run.folder, e.label) for e in entries]
-    image = base64.b64encode(figures.png(figures.draw_panels(curves, task))).decode()
+    source = f"data:image/png;base64,{base64.b64encode(image).decode()}"
     yield f"<h2>{_text(task)}</h2>"
     yield (
-        f"<figure><img alt='Return, cost and cost rate on {_text(task)}' src='data:image/png;base64,{image}'>"
+        f"<figure><img alt='Return, cost and cost rate on {_text(task)}' src='{source}'>"
         "<figcaption>Thick: mean over seeds. Band: standard deviation. Thin: every seed. "
         "Dashed: mean of the demonstrations.</figcaption></figure>"
     )
@@ -229,10 +245,16 @@ def run(arguments: argparse.Namespace) -> None:
     entries = read_entries(arguments.runs)
     path = arguments.out or (arguments.runs[0] if len(entries) == 1 else Path()) / "report.html"
     command_line.check_writable(path.parent, "--out")
-    path.write_text(
-        page(entries, seed=arguments.seed, player=None if arguments.no_animation else animate), encoding="utf-8"
-    )
-    print(f"written to {path}")
+    if arguments.figures:
+        command_line.check_writable(arguments.figures, "--figures")
+    images = draw_tasks(entries)
+    player = None if arguments.no_animation else animate
+    path.write_text(page(entries, images, seed=arguments.seed, player=player), encoding="utf-8")
+    print(f"page    {path}")
+    for task, image in images.items() if arguments.figures else ():
+        figure = arguments.figures / f"{task}.png"
+        figure.write_bytes(image)
+        print(f"figure  {figure}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

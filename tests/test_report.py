@@ -4,6 +4,7 @@ import base64
 import html.parser
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +94,14 @@ class Page(html.parser.HTMLParser):
             self.cells[-1] += data
 
 
+def make_page(folders: Sequence[Path]) -> str:
+    entries = report.read_entries(folders)
+    return report.page(entries, report.draw_tasks(entries))
+
+
 def test_page_is_self_contained_and_shows_every_seed(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "gail", level=70.0, max_kl=0.02)]
-    text = report.page(report.read_entries(folders))
+    text = make_page(folders)
     page = Page(text)
     assert page.open == []
     assert len(page.addresses) == 1
@@ -115,16 +121,16 @@ def test_page_is_self_contained_and_shows_every_seed(tmp_path: Path) -> None:
 
 def test_runs_of_several_tasks_are_also_pooled(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "malm", task="Ant", level=70.0)]
-    page = Page(report.page(report.read_entries(folders)))
+    page = Page(make_page(folders))
     rows = " | ".join(page.cells)
     assert "malm | 2 | 70.00 [" in rows  # interquartile mean of 50, 60, 70, 70, 80, 90
     assert len(page.addresses) == 2
 
 
 def test_two_runs_of_one_method_are_told_apart(tmp_path: Path) -> None:
-    entries = report.read_entries([make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "malm")])
-    assert [e.label for e in entries] == ["malm (a)", "malm (b)"]
-    assert "All fields are equal" in report.page(entries)
+    folders = [make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "malm")]
+    assert [e.label for e in report.read_entries(folders)] == ["malm (a)", "malm (b)"]
+    assert "All fields are equal" in make_page(folders)
 
 
 def test_report_writes_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -133,6 +139,8 @@ def test_report_writes_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFi
     assert (folder / "report.html").read_text().startswith("<!DOCTYPE html>")
     assert report.main([str(folder), "--out", str(tmp_path / "x.html")]) == 0  # nothing to play without a checkpoint
     assert (tmp_path / "x.html").read_text() == (folder / "report.html").read_text()
+    assert report.main([str(folder), "--no-animation", "--figures", str(tmp_path / "png")]) == 0
+    assert matplotlib.image.imread(tmp_path / "png" / "Swimmer.png").shape[1] > 1000
     (folder / "summary.json").unlink()
     with pytest.raises(SystemExit) as end:
         report.main([str(folder)])
