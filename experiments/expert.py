@@ -20,11 +20,13 @@ from experiments.resuming import resumed
 from experiments.summary import number, show
 from experiments.training import Outcome, Plan, execute
 
+DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
+
 
 def make_parser() -> Parser:
     """The options of this launcher, `Config` fields included."""
     parser = Parser("expert", __doc__ or "")
-    options.add_run_options(parser)
+    options.add_run_options(parser, DEFAULTS)
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
     parser.add_argument("--unconstrained", action="store_true", help="plain TRPO, blind to the cost (no --cost-limit)")
@@ -35,7 +37,7 @@ def make_parser() -> Parser:
         "--run-dir", type=Path, metavar="DIR", help="run folder of the training (default: runs/<task>_<method>_<time>)"
     )
     parser.add_argument("--resume", action="store_true", help="continue the run in --run-dir from its last checkpoint")
-    options.add_config_options(parser, hide=("method",))
+    options.add_config_options(parser, DEFAULTS["preset"], hide=("method",))
     return parser
 
 
@@ -52,7 +54,7 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         raise UsageError(f"--out {arguments.out}: exists; choose another name or add --overwrite")
     if arguments.resume:
         given = resumed(arguments.run_dir, given, "--run-dir")
-    choices = {**options.DEFAULTS, "env": None, **given}
+    choices = {**DEFAULTS, "env": None, **given}
     task = options.find_task(choices["env"])
     if not arguments.unconstrained:
         choices.setdefault("cost_limit", task.cost_limit)

@@ -25,11 +25,11 @@ DEFAULTS: Mapping[str, Any] = {
 }
 
 
-def add_run_options(parser: Parser) -> None:
+def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> None:
     """Everything in `DEFAULTS` and --env. What is not given is absent from the parsed arguments."""
 
     def add(name: str, text: str, **settings: Any) -> None:
-        default = DEFAULTS.get(name)
+        default = defaults.get(name)
         suffix = "" if default is None else f" (default: {str(default).lower()})"
         parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, help=text + suffix, **settings)
 
@@ -44,15 +44,19 @@ def add_run_options(parser: Parser) -> None:
     add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
 
 
-def add_config_options(parser: Parser, *, hide: Sequence[str] = ()) -> None:
-    """One option per `Config` field, except `hide`. What is not given is absent from the parsed arguments."""
+def add_config_options(parser: Parser, preset: str, *, hide: Sequence[str] = ()) -> None:
+    """One option per `Config` field, except `hide`; `--help` shows the preset's values.
+
+    What is not given is absent from the parsed arguments.
+    """
     static = parser.add_argument_group("hyperparameters that shape the program (a change compiles anew)")
     traced = parser.add_argument_group("hyperparameters inside the program")
     for field in dataclasses.fields(Config):
         if field.name in hide:
             continue
         choices = f"; one of {', '.join(CHOICES[field.name])}" if field.name in CHOICES else ""
-        default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else str(field.default)
+        value = PRESETS[preset].get(field.name, field.default)
+        default = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
         (traced if field.metadata["traced"] else static).add_argument(
             "--" + field.name.replace("_", "-"),
             dest=field.name,

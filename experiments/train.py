@@ -30,7 +30,7 @@ def make_parser() -> Parser:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/<task>_<method>_<time>)")
     parser.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
-    options.add_config_options(parser, hide=("method",))
+    options.add_config_options(parser, options.DEFAULTS["preset"], hide=("method",))
     return parser
 
 

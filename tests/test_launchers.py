@@ -1,14 +1,15 @@
 """Launchers: options, the choice of the expert, and one tiny pipeline for real."""
 
 import dataclasses
+import re
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ccil_jax.config import Config
+from ccil_jax.config import PRESETS, Config
 from ccil_jax.demonstrations import load_demonstrations
 from experiments import evaluate, expert, options, run_folder, train
 from experiments.command_line import Parser
@@ -18,7 +19,7 @@ TINY = ["--preset", "tiny", "--max-episode-steps", "20", "--num-seeds", "2", "--
 
 def test_options_are_the_fields_of_config() -> None:
     parser = Parser("x", "")
-    options.add_config_options(parser)
+    options.add_config_options(parser, "paper")
     arguments = parser.parse_args(
         ["--max_kl", "0.02", "--num-envs=8", "--hidden-sizes", "32,16", "--env_steps", "3e5", "--gae_lambda=1"]
     )
@@ -33,6 +34,15 @@ def test_options_are_the_fields_of_config() -> None:
     assert options.config_from(given, "paper") == Config(**given)
     assert options.config_from({"batch_size": 400}, "tiny").hidden_sizes == (8, 8)
     assert set(options.CONFIG_FIELDS) <= set(vars(parser.parse_args(_every_option())))
+
+
+@pytest.mark.parametrize(("launcher", "batch_size"), [(train, 2000), (expert, 4000)])
+def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleType, batch_size: int) -> None:
+    text = " ".join(launcher.make_parser().format_help().split())
+    preset = re.search(r"hyperparameters to start from \(default: (\w+)\)", text)
+    assert preset
+    assert PRESETS[preset[1]].get("batch_size", Config().batch_size) == batch_size
+    assert f"K (Table 1) (default: {batch_size})" in text
 
 
 def _every_option() -> list[str]:
