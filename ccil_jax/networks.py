@@ -55,12 +55,16 @@ def _mlp(config: Config, out: int, final_scale: float) -> MLP:
     return MLP((*config.hidden_sizes, out), ACTIVATIONS[config.activation], final_scale)
 
 
-def make_policy(config: Config, obs_dim: int, action_dim: int) -> Policy:
-    """Gaussian policy: mean from an MLP whose last layer starts small, log-std a free vector from 0 (authors)."""
+def make_policy(config: Config, obs_dim: int, action_dim: int, initial_std: jax.typing.ArrayLike = 1.0) -> Policy:
+    """Gaussian policy: mean from an MLP whose last layer starts small, log-std a free vector (authors).
+
+    `initial_std` is [action_dim] or one for all.
+    """
     mlp = _mlp(config, action_dim, final_scale=0.01)
 
     def init(key: jax.Array) -> PyTree:
-        return {"mean": mlp.init(key, jnp.zeros((1, obs_dim))), "log_std": jnp.zeros(action_dim)}
+        log_std = jnp.broadcast_to(jnp.log(jnp.asarray(initial_std, jnp.result_type(float))), action_dim)
+        return {"mean": mlp.init(key, jnp.zeros((1, obs_dim))), "log_std": log_std}
 
     def apply(params: PyTree, obs: Float[Array, "... D"]) -> Gaussian:
         mean: jax.Array = mlp.apply(params["mean"], obs)  # type: ignore[assignment]  # flax: Any or a tuple

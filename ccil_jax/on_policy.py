@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from ccil_jax import distributions, networks, policy_step, regression, reward_models, rollout, running_statistics
@@ -59,7 +60,9 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     """Builds the agent of `config.method`. `config.cost_limit` must be set; `expert` is None for task rewards."""
     method = METHODS[config.method]
     constraint = method.constraint(config)
-    policy = networks.make_policy(config, env.obs_dim, env.action_dim)
+    # 1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped.
+    initial_std = np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std)
     critic = networks.make_scalar(config, env.obs_dim)
     if method.reward == "discriminator":
         assert expert is not None, f"{config.method} learns from demonstrations"

@@ -75,6 +75,14 @@ def fresh_state() -> AgentState:
     return jax.jit(on_policy.make(COUNTER_CONFIG, Counter(), None).init)(jax.random.key(0))
 
 
+@pytest.mark.parametrize(("bound", "std"), [(0.4, 0.4), (1.0, 1.0), (100.0, 1.0), (np.inf, 1.0)])
+def test_the_first_actions_fit_the_action_range(bound: float, std: float) -> None:
+    agent = on_policy.make(COUNTER_CONFIG, Counter(action_bound=bound), None)
+    params = jax.jit(agent.init)(jax.random.key(0)).actor.policy_params
+    assert params["log_std"].shape == (1,)
+    np.testing.assert_allclose(np.exp(params["log_std"]), std, rtol=1e-6)
+
+
 # Rollouts ------------------------------------------------------------------------------------------------------------
 
 
