@@ -43,7 +43,7 @@ TASKS: Mapping[str, TaskInfo] = MappingProxyType(
             _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
             _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
             _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
-            _locomotion("Ant", (27, 8), 1.0, 300.0, "0.5 * sum of squared actions + contact cost"),
+            _locomotion("Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost"),
             _locomotion("Humanoid", (270, 17), 0.2, 40.0, "0.1 * sum of squared actions + contact cost"),
         )
     )
