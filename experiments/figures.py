@@ -18,6 +18,7 @@ PANELS = (
     ("episode_cost", "Cost per episode"),
     ("cost_rate", "Cost rate"),
 )
+_MAX_POINTS = 100  # of a curve: few episodes end in an iteration, and their scatter would hide the learning
 COLORS = ("#0b6e99", "#d1495b", "#6a994e", "#e09f3e", "#7b5ea7", "#3d405b", "#00a5a5", "#a44a3f")
 _STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -105,11 +106,26 @@ def _steps_per_iteration(curve: Curve) -> int:
     return int(curve.metrics["env_steps"][0, 0])
 
 
+def _window(curve: Curve) -> int:
+    """Iterations behind one point of the curve."""
+    return -(-len(curve.metrics["env_steps"]) // _MAX_POINTS)
+
+
+def binned(values: np.ndarray, window: int) -> np.ndarray:
+    """Means over `window` rows in turn, the last over what is left: [T, ...] -> [ceil(T / window), ...]; NaN stays."""
+    starts = np.arange(0, len(values), window)
+    counts = np.diff([*starts, len(values)]).reshape(-1, *[1] * (values.ndim - 1))
+    means: np.ndarray = np.add.reduceat(values, starts, axis=0, dtype=np.float64) / counts
+    return means
+
+
 def _draw_curve(axes: Axes, curve: Curve, name: str, color: str, *, by_iteration: bool) -> None:
     values = curve.metrics[name]  # [num_iterations, num_seeds]
     if name != "cost_rate" and "episodes_finished" in curve.metrics:  # before the first end there is nothing to show
         values = np.where(np.cumsum(curve.metrics["episodes_finished"], axis=0) > 0, values, np.nan)
     x = np.arange(1, len(values) + 1) if by_iteration else curve.metrics["env_steps"][:, 0]
+    window = _window(curve)
+    x, values = binned(x, window), binned(values, window)
     mean, deviation = values.mean(axis=1), values.std(axis=1)
     if values.shape[1] > 1:
         axes.plot(x, values, color=color, linewidth=0.7, alpha=0.35)
@@ -135,8 +151,10 @@ def _decorate(figure: Figure, curves: Sequence[Curve], task: str) -> None:
             handles.setdefault(label, handle)
     counts = sorted({c.metrics["env_steps"].shape[1] for c in curves})
     seeds = " or ".join(str(c) for c in counts)
+    windows = sorted({_window(c) for c in curves})
+    points = "" if windows == [1] else f"; each point: {' or '.join(map(str, windows))} iterations"
     figure.suptitle(
-        f"{task}: mean and standard deviation over {seeds} seed{'' if counts == [1] else 's'}",
+        f"{task}: mean and standard deviation over {seeds} seed{'' if counts == [1] else 's'}{points}",
         x=0.008,
         horizontalalignment="left",
         fontsize=10.5,

@@ -148,6 +148,12 @@ def test_report_writes_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFi
     assert "not finished" in capsys.readouterr().err
 
 
+def test_long_curves_are_drawn_as_means_over_iterations() -> None:
+    np.testing.assert_allclose(figures.binned(np.array([1.0, 3.0, 5.0, 7.0, 4.0]), 2), [2.0, 6.0, 4.0])
+    by_seed = figures.binned(np.array([[np.nan, 1.0], [2.0, 3.0]]), 2)
+    np.testing.assert_array_equal(by_seed, [[np.nan, 2.0]])
+
+
 def test_curves_start_with_the_first_finished_episode(tmp_path: Path) -> None:
     figure = figures.draw_panels([figures.read_curve(make_run(tmp_path / "a", "malm"))], "Swimmer")
     mean = {axes.get_title(loc="left"): np.asarray(axes.lines[-2].get_ydata()) for axes in figure.axes}
