@@ -1,6 +1,7 @@
 """One compiled program over all seeds: `jit(vmap(scan(iteration)))`, spread over the local devices."""
 
 import dataclasses
+import math
 import os
 import time
 from collections.abc import Callable
@@ -42,9 +43,20 @@ def seed_mesh(num_seeds: int) -> jax.sharding.Mesh:
     return jax.make_mesh((size,), ("seeds",), axis_types=(AxisType.Auto,), devices=devices[:size])
 
 
-def compile_program(config: Config, env: Environment, expert: ExpertData | None, num_seeds: int) -> Program:
-    """`jit(vmap(scan(iteration)))` over seeds, compiled once and spread over `seed_mesh`. `config` must be resolved."""
-    chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if config.num_iterations % n == 0)
+def compile_program(
+    config: Config, env: Environment, expert: ExpertData | None, num_seeds: int, num_done: int = 0
+) -> Program:
+    """`jit(vmap(scan(iteration)))` over seeds, compiled once and spread over `seed_mesh`.
+
+    Args:
+        config: resolved.
+        env: one environment, unbatched.
+        expert: None for task rewards.
+        num_seeds: S.
+        num_done: iterations behind a run that is continued: chunks lead from there to exactly `num_iterations`.
+    """
+    common = math.gcd(config.num_iterations, num_done)
+    chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if common % n == 0)
     mesh = seed_mesh(num_seeds)
 
     def init(config: Config, expert: ExpertData | None, keys: jax.Array) -> AgentState:

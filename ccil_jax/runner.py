@@ -126,13 +126,13 @@ def train(
     config = resolve(config, env, demonstrations)
     if num_seeds < 1:
         raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
-    program = compile_program(config, env, expert_data(demonstrations), num_seeds)
     keys = jax.random.split(jax.random.key(seed), num_seeds)
     last = min(stop_after or config.num_iterations, config.num_iterations)
 
     with contextlib.ExitStack() as stack:
         checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
         done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
+        program = compile_program(config, env, expert_data(demonstrations), num_seeds, num_done=done)
         if checkpoints and done:
             like = {"state": program.state, "history": checkpoints.structure(done)["history"]}
             saved = checkpoints.restore(done, like)
