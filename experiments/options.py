@@ -51,11 +51,12 @@ def add_config_options(parser: Parser, preset: str, *, hide: Sequence[str] = ())
     """
     static = parser.add_argument_group("hyperparameters that shape the program (a change compiles anew)")
     traced = parser.add_argument_group("hyperparameters inside the program")
+    defaults = Config(**PRESETS[preset])
     for field in dataclasses.fields(Config):
         if field.name in hide:
             continue
         choices = f"; one of {', '.join(CHOICES[field.name])}" if field.name in CHOICES else ""
-        value = PRESETS[preset].get(field.name, field.default)
+        value = getattr(defaults, field.name)
         default = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
         (traced if field.metadata["traced"] else static).add_argument(
             "--" + field.name.replace("_", "-"),

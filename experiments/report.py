@@ -251,10 +251,11 @@ def run(arguments: argparse.Namespace) -> None:
     player = None if arguments.no_animation else animate
     path.write_text(page(entries, images, seed=arguments.seed, player=player), encoding="utf-8")
     print(f"page    {path}")
-    for task, image in images.items() if arguments.figures else ():
-        figure = arguments.figures / f"{task}.png"
-        figure.write_bytes(image)
-        print(f"figure  {figure}")
+    if arguments.figures:
+        for task, image in images.items():
+            figure = arguments.figures / f"{task}.png"
+            figure.write_bytes(image)
+            print(f"figure  {figure}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
