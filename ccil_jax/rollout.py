@@ -95,10 +95,9 @@ def rollout(
             episode_cost=stepped.episode_cost,
             episode_length=length,
         )
-        fresh = jax.vmap(env.reset)(reset_keys)
         return (
             RolloutState(
-                env_state=select(stepped.done, fresh, stepped),
+                env_state=reset_done(env, stepped, reset_keys),
                 episode_length=jnp.where(stepped.done, 0, length),
                 whole=state.whole | stepped.done,
             ),
@@ -106,6 +105,24 @@ def rollout(
         )
 
     return jax.lax.scan(step, state, (noise, reset_keys))
+
+
+def reset_done(env: Environment, state: State, keys: jax.Array) -> State:
+    """`state` [N] with a fresh episode wherever one is done.
+
+    A loop of at most one turn: vmapped over seeds, `lax.cond` would reset at every step, the loop only when some
+    environment of some seed is done.
+    """
+
+    def pending(carry: tuple[jax.Array, State]) -> jax.Array:
+        return jnp.any(carry[0])
+
+    def reset(carry: tuple[jax.Array, State]) -> tuple[jax.Array, State]:
+        # The barrier ties the keys to this turn: XLA would move what depends on nothing else out of the loop.
+        (done, state), turn_keys = jax.lax.optimization_barrier((carry, keys))
+        return jnp.zeros_like(done), select(done, jax.vmap(env.reset)(turn_keys), state)
+
+    return jax.lax.while_loop(pending, reset, (state.done, state))[1]
 
 
 def select(mask: jax.Array, on_true: PyTree, on_false: PyTree) -> PyTree:

@@ -98,7 +98,8 @@ class Roller:
         )
         self.state: RolloutState = rollout.init(env, num_envs, jax.random.key(1))
         self._key = jax.random.key(2)
-        self._roll = jax.jit(lambda state, key: rollout.rollout(env, policy.apply, actor, state, NUM_STEPS, key))
+        self.rollout = lambda state, key: rollout.rollout(env, policy.apply, actor, state, NUM_STEPS, key)
+        self._roll = jax.jit(self.rollout)
 
     def roll(self) -> Transition:
         """The next batch [T, N]."""
@@ -158,6 +159,27 @@ def test_episodes_begin_anew_at_random() -> None:
     assert (np.abs(starts) <= 1).all()
     assert steps.terminated.any()
     assert (steps.done & ~steps.terminated).any()
+
+
+def test_environments_are_reset_only_where_an_episode_ends() -> None:
+    """Resets may be dear. Seeds are vmapped, and a reset depends on nothing but its key: XLA must not hoist it."""
+    calls: list[tuple[int, ...]] = []
+
+    class Counted(Counter):
+        def start(self, key: jax.Array) -> jax.Array:
+            def host(data: np.ndarray) -> np.ndarray:
+                calls.append(np.shape(data))
+                return np.zeros(np.shape(data)[:-1], np.float32)
+
+            shape = jax.ShapeDtypeStruct((), jnp.float32)
+            return jax.pure_callback(host, shape, jax.random.key_data(key), vmap_method="broadcast_all")
+
+    roller = Roller(Counted(), 2)
+    roll = jax.jit(jax.vmap(roller.rollout))
+    state = jax.tree.map(lambda x: jnp.stack([x, x, x]), roller.state)
+    calls.clear()
+    jax.block_until_ready(roll(state, jax.random.split(jax.random.key(0), 3)))
+    assert calls == [(3, 2, 2)]  # 4 steps, of which one ends an episode, in all three seeds at once
 
 
 def test_the_policy_step_sees_observations_normalised_as_when_the_actions_were_drawn(
