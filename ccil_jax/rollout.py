@@ -11,7 +11,7 @@ from ccil_jax import distributions, running_statistics
 from ccil_jax.distributions import Gaussian
 from ccil_jax.running_statistics import RunningStatistics
 from ccil_jax.types import PyTree, Transition
-from envs.base import Environment, State
+from envs.base import Environment, State, compute_where
 
 
 @struct.dataclass(kw_only=True)
@@ -76,6 +76,9 @@ def rollout(
     noise = jax.random.normal(noise_key, (num_steps, num_envs, env.action_dim))
     reset_keys = jax.random.split(reset_key, (num_steps, num_envs))
 
+    def refresh(state: State, key: jax.Array) -> State:
+        return compute_where(state.done, env.reset, state, key)
+
     def step(state: RolloutState, inputs: tuple[jax.Array, jax.Array]) -> tuple[RolloutState, Transition]:
         noise, reset_keys = inputs
         obs = state.env_state.obs
@@ -97,7 +100,7 @@ def rollout(
         )
         return (
             RolloutState(
-                env_state=reset_done(env, stepped, reset_keys),
+                env_state=jax.vmap(refresh)(stepped, reset_keys),
                 episode_length=jnp.where(stepped.done, 0, length),
                 whole=state.whole | stepped.done,
             ),
@@ -105,30 +108,3 @@ def rollout(
         )
 
     return jax.lax.scan(step, state, (noise, reset_keys))
-
-
-def reset_done(env: Environment, state: State, keys: jax.Array) -> State:
-    """`state` [N] with a fresh episode wherever one is done.
-
-    A loop of at most one turn: vmapped over seeds, `lax.cond` would reset at every step, the loop only when some
-    environment of some seed is done.
-    """
-
-    def pending(carry: tuple[jax.Array, State]) -> jax.Array:
-        return jnp.any(carry[0])
-
-    def reset(carry: tuple[jax.Array, State]) -> tuple[jax.Array, State]:
-        # The barrier ties the keys to this turn: XLA would move what depends on nothing else out of the loop.
-        (done, state), turn_keys = jax.lax.optimization_barrier((carry, keys))
-        return jnp.zeros_like(done), select(done, jax.vmap(env.reset)(turn_keys), state)
-
-    return jax.lax.while_loop(pending, reset, (state.done, state))[1]
-
-
-def select(mask: jax.Array, on_true: PyTree, on_false: PyTree) -> PyTree:
-    """Element-wise choice between two pytrees; `mask` is [N] and broadcasts over trailing axes."""
-
-    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
-
-    return jax.tree.map(choose, on_true, on_false)

@@ -4,12 +4,15 @@ An environment is a set of pure functions of one simulation; callers `vmap` them
 Auto-reset is not here: `ccil_jax.rollout` owns it, so `step` always returns the true successor.
 """
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 PyTree = Any
+Tree = TypeVar("Tree")
 
 
 @struct.dataclass(kw_only=True)
@@ -65,3 +68,30 @@ class Environment(Protocol):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. `action` is `[action_dim]`; stepping a done state is undefined."""
+
+
+def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tree, *args: PyTree) -> Tree:
+    """`compute(*args)` where `needed` [] bool, else `otherwise`: for what is dear and rarely needed, as a reset.
+
+    Vmapped, it computes only when some simulation of the batch needs it, while `lax.cond` would at every step.
+    """
+
+    def turn(carry: tuple[jax.Array, Tree]) -> tuple[jax.Array, Tree]:
+        # The barrier ties the arguments to this turn: XLA moves out of a loop what depends on nothing in it. Keys pass
+        # it as plain numbers: JAX's check of key reuse does not know that the loop turns once.
+        needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(_numbers, args)))
+        return jnp.zeros_like(needed), compute(*jax.tree.map(_like, args, bound))
+
+    return jax.lax.while_loop(lambda carry: carry[0], turn, (needed, otherwise))[1]
+
+
+def _is_key(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _numbers(leaf: jax.Array) -> jax.Array:
+    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+
+
+def _like(leaf: jax.Array, numbers: jax.Array) -> jax.Array:
+    return jax.random.wrap_key_data(numbers, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else numbers
