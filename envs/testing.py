@@ -56,7 +56,13 @@ def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:
     np.testing.assert_array_equal(states.step_count, np.broadcast_to(1 + np.arange(num_steps), (num_envs, num_steps)))
     np.testing.assert_allclose(states.episode_return, np.cumsum(states.reward, axis=1), rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(states.episode_cost, np.cumsum(states.cost, axis=1))
-    jax.tree.map(np.testing.assert_array_equal, run(keys), once)
+    jax.tree.map(_assert_equal, run(keys), once)
     step = jax.jit(jax.vmap(env.step))
     clipped = step(first, jnp.clip(actions[:, 0], env.action_low, env.action_high))
-    jax.tree.map(np.testing.assert_array_equal, clipped, step(first, actions[:, 0]))
+    jax.tree.map(_assert_equal, clipped, step(first, actions[:, 0]))
+
+
+def _assert_equal(a: jax.Array, b: jax.Array) -> None:
+    if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+        a, b = jax.random.key_data(a), jax.random.key_data(b)
+    np.testing.assert_array_equal(a, b)

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import jax
 import mujoco
 
-from envs.physics.base import Data, Physics
+from envs.physics.base import Data, Mocap, Physics
 
-__all__ = ["Data", "Physics", "make_physics", "resolve"]
+__all__ = ["Data", "Mocap", "Physics", "make_physics", "resolve"]
 
 
 def resolve(name: str) -> str:
@@ -24,6 +24,7 @@ def make_physics(
     num_substeps: int,
     fields: Sequence[str] = (),
     track: Sequence[str] = (),
+    refresh: bool = False,
     num_threads: int | None = None,
 ) -> Physics:
     """Builds a backend.
@@ -34,6 +35,7 @@ def make_physics(
         num_substeps: engine steps per control step.
         fields: derived `MjData` arrays that `Data.fields` shall hold, e.g. "cfrc_ext".
         track: `MjData` arrays whose change over the control step `Data.change` shall hold, e.g. "qpos".
+        refresh: whether a control step ends with a forward pass, so that `Data.fields` belong to the new state.
         num_threads: of `native`; None shares the usable CPUs among the local devices. The other backends ignore it.
 
     Raises:
@@ -44,9 +46,10 @@ def make_physics(
     if name == "native":
         from envs.physics.native import NativePhysics
 
-        return NativePhysics(model, num_substeps, fields=fields, track=track, num_threads=num_threads)
+        return NativePhysics(model, num_substeps, fields=fields, track=track, refresh=refresh, num_threads=num_threads)
     if name in ("mjx", "warp"):
         from envs.physics.mjx import MjxPhysics
 
-        return MjxPhysics(model, num_substeps, fields=fields, track=track, impl="jax" if name == "mjx" else "warp")
+        impl = "jax" if name == "mjx" else "warp"
+        return MjxPhysics(model, num_substeps, fields=fields, track=track, refresh=refresh, impl=impl)
     raise ValueError(f"unknown physics {name!r}: choose one of auto, native, mjx, warp")

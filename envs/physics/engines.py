@@ -25,8 +25,8 @@ class Engine(Protocol):
     def bind(self, name: str) -> np.ndarray:
         """`[num_sims, ...]`, refreshed by each call."""
 
-    def step(self, *, nstep: int) -> None:
-        """`nstep` engine steps under constant controls."""
+    def step(self, *, nstep: int, stage: int = 0) -> None:
+        """`nstep` engine steps under constant controls, then the forward pass up to a `mjtStage`."""
 
     def forward(self) -> None:
         """The forward pass: derived arrays at the present state."""
@@ -62,11 +62,13 @@ class PostConstraintEngine:
         """`[num_sims, ...]`, refreshed by each call."""
         return self._outputs[name]
 
-    def step(self, *, nstep: int) -> None:
-        """`nstep` engine steps under constant controls, then the post-constraint pass."""
+    def step(self, *, nstep: int, stage: int = 0) -> None:
+        """`nstep` engine steps under constant controls, the forward pass if asked for, the post-constraint pass."""
 
         def advance(data: mujoco.MjData) -> None:
             mujoco.mj_step(self._model, data, nstep)
+            if stage:
+                mujoco.mj_forward(self._model, data)
             mujoco.mj_rnePostConstraint(self._model, data)
 
         self._run(advance)

@@ -15,7 +15,7 @@ import mujoco
 from flax import struct
 from jax.typing import ArrayLike
 
-from envs.physics.base import Data
+from envs.physics.base import Data, Mocap
 from envs.physics.mjx_patch import align_plane_capsule_frames
 
 # MJX-Warp allots contacts for all simulations together: 32 each for 8,192.
@@ -33,7 +33,7 @@ class _Carry:
 
 
 class MjxPhysics:
-    """See `Physics`. Models without activations, mocap bodies or actuator history.
+    """See `Physics`. Models without activations or actuator history.
 
     The solver is the model's own, but for PGS (Humanoid), which MJX lacks: Newton takes its place and differs by
     4e-10 in a step's velocity (median). The native backend keeps PGS, for parity with gymnasium.
@@ -46,6 +46,7 @@ class MjxPhysics:
         fields: derived `MjData` arrays for `Data.fields`; "cfrc_ext" only with impl "jax". If there are any, or
             derived arrays in `track`, `init` runs the forward pass.
         track: `MjData` arrays for `Data.change`; in float32 unless x64 is enabled.
+        refresh: whether a control step ends with a forward pass.
         impl: "jax" or "warp". Warp is not bit-deterministic.
 
     Raises:
@@ -60,6 +61,7 @@ class MjxPhysics:
         *,
         fields: Sequence[str] = (),
         track: Sequence[str] = (),
+        refresh: bool = False,
         impl: str = "jax",
     ):
         self.name = "mjx" if impl == "jax" else impl
@@ -77,13 +79,14 @@ class MjxPhysics:
         # Strongly typed: MJX's `time` is a weak float, which would make every scan over it trace twice.
         self._template = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), mjx.make_data(model, impl=impl, **limits))
         self._num_substeps = num_substeps
+        self._refresh = refresh
         self._fields, self._track = tuple(fields), tuple(track)
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in ("qpos", "qvel")))
         self._forces = "cfrc_ext" in fields
 
-    def init(self, qpos: ArrayLike, qvel: ArrayLike) -> Data:
+    def init(self, qpos: ArrayLike, qvel: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.init`."""
-        template = self._template
+        template = self._template if mocap is None else _place(self._template, mocap.pos, mocap.quat)
         data = template.replace(
             qpos=jnp.asarray(qpos, template.qpos.dtype), qvel=jnp.asarray(qvel, template.qvel.dtype)
         )
@@ -91,7 +94,7 @@ class MjxPhysics:
             data = self._mjx.forward(self._model, data)
         return self._pack(data, {n: jnp.zeros_like(read(data, n)) for n in self._track})
 
-    def step(self, data: Data, ctrl: ArrayLike) -> Data:
+    def step(self, data: Data, ctrl: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.step`."""
         carry = data.backend
         before = carry.tracked | {"qpos": carry.qpos, "qvel": carry.qvel}
@@ -102,12 +105,19 @@ class MjxPhysics:
             ctrl=jnp.asarray(ctrl, self._template.ctrl.dtype),
         )
 
-        def substep(state: Any, _: None) -> tuple[Any, None]:
-            new = self._mjx.step(self._model, state)
+        path = None
+        if mocap is not None:
+            path = mocap.pos if mocap.pos.ndim == 3 else None
+            state = _place(state, mocap.pos if path is None else path[0], mocap.quat)
+
+        def substep(state: Any, pos: jax.Array | None) -> tuple[Any, None]:
+            new = self._mjx.step(self._model, state if pos is None else _place(state, pos))
             # With x64, MJX 3.17 changes the integer types of tendon arrays: a scan's carry must keep its types.
             return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), new, state), None
 
-        state, _ = jax.lax.scan(substep, state, None, length=self._num_substeps)
+        state, _ = jax.lax.scan(substep, state, path, length=self._num_substeps)
+        if self._refresh:
+            state = self._mjx.forward(self._model, state)
         if self._forces:
             state = self._mjx.rne_postconstraint(self._model, state)
         return self._pack(state, {n: read(state, n) - before[n] for n in self._track})
@@ -121,6 +131,12 @@ class MjxPhysics:
             change=change,
             backend=_Carry(qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart, tracked=tracked),
         )
+
+
+def _place(data: Any, pos: jax.Array, quat: jax.Array | None = None) -> Any:
+    """`data` with its mocap bodies at `pos`, turned to `quat` if given."""
+    turned = {} if quat is None else {"mocap_quat": jnp.asarray(quat, data.mocap_quat.dtype)}
+    return data.replace(mocap_pos=jnp.asarray(pos, data.mocap_pos.dtype), **turned)
 
 
 def read(data: Any, name: str) -> jax.Array:

@@ -5,6 +5,7 @@ hides in the engine: a step is a function of its arguments alone, and replays of
 """
 
 import contextlib
+import dataclasses
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from mujoco.batch import SimulationError
 
-from envs.physics.base import Data
+from envs.physics.base import Data, Mocap
 from envs.physics.bits import float64_bits
 from envs.physics.engines import Engine, make_engine
 
@@ -48,6 +49,7 @@ class NativePhysics:
         fields: derived `MjData` arrays for `Data.fields`. If there are any, `init` runs the engine's forward pass.
         track: `MjData` arrays for `Data.change`. Derived ones are compared with their value after the last control
             step, as gymnasium does, so they are carried along in the bits.
+        refresh: whether a control step ends with a forward pass.
         num_threads: of one engine; None shares the usable CPUs among the local devices.
     """
 
@@ -60,10 +62,12 @@ class NativePhysics:
         *,
         fields: Sequence[str] = (),
         track: Sequence[str] = (),
+        refresh: bool = False,
         num_threads: int | None = None,
     ):
         self._model = model
         self._num_substeps = num_substeps
+        self._last_stage = int(mujoco.mjtStage.mjSTAGE_ACC if refresh else mujoco.mjtStage.mjSTAGE_NONE)
         # Each of JAX's CPU devices runs its own simulations, side by side with the others.
         self._num_threads = num_threads or max(1, usable_cpus() // jax.local_device_count())
         self._lock = threading.Lock()
@@ -73,7 +77,7 @@ class NativePhysics:
         template = mujoco.MjData(model)
         self._shapes = {n: np.shape(getattr(template, n)) for n in ("qpos", "qvel", *self._derived)}
         # The state's components up to the warm start, and the controls right behind them: all that the next step
-        # reads (models here use neither applied forces nor mocap bodies).
+        # reads beside mocap poses (no model here has applied forces).
         self._num_state = mujoco.mj_stateSize(
             model,
             int(mujoco.mjtState.mjSTATE_PHYSICS | mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_WARMSTART),
@@ -86,27 +90,28 @@ class NativePhysics:
             self._shapes | {f"change/{n}": self._shapes[n] for n in self._track},
         )
 
-    def init(self, qpos: ArrayLike, qvel: ArrayLike) -> Data:
+    def init(self, qpos: ArrayLike, qvel: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.init`. Without derived arrays the engine is not called: auto-reset runs this at each step."""
         dtype = jnp.result_type(float)
         qpos, qvel = jnp.asarray(qpos, dtype), jnp.asarray(qvel, dtype)
         rest = jnp.zeros(self._row_size - 1 - self._model.nq - self._model.nv, dtype)
         bits = float64_bits(jnp.concatenate([jnp.zeros(1, dtype), qpos, qvel, rest]))
         if self._derived:
-            return self._call(self._forward, bits, jnp.zeros(self._model.nu, dtype))
+            return self._call(self._forward, bits, jnp.zeros(self._model.nu, dtype), mocap)
         change = {n: jnp.zeros(self._shapes[n], dtype) for n in self._track}
         return Data(qpos=qpos, qvel=qvel, fields={}, change=change, backend=bits)
 
-    def step(self, data: Data, ctrl: ArrayLike) -> Data:
+    def step(self, data: Data, ctrl: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.step`."""
-        return self._call(self._advance, data.backend, jnp.asarray(ctrl))
+        return self._call(self._advance, data.backend, jnp.asarray(ctrl), mocap)
 
-    def _call(self, function: Callable[..., None], bits: jax.Array, ctrl: jax.Array) -> Data:
+    def _call(self, function: Callable[..., None], bits: jax.Array, ctrl: jax.Array, mocap: Mocap | None) -> Data:
         shapes = (
             jax.ShapeDtypeStruct((2 * self._row_size,), jnp.uint32),
             jax.ShapeDtypeStruct((self._output_size,), jnp.result_type(float)),
         )
-        bits, values = host_call(function, shapes, bits, ctrl)
+        poses = () if mocap is None else (mocap.quat.ravel(), mocap.pos.ravel())
+        bits, values = host_call(function, shapes, bits, ctrl, *poses)
 
         def output(name: str, like: str) -> jax.Array:
             flat: jax.Array = values[self._outputs[name]]
@@ -136,16 +141,24 @@ class NativePhysics:
 
     # What follows runs on the host, inside a running JAX program: NumPy only, a JAX call could deadlock.
 
-    def _advance(self, bits: np.ndarray, ctrl: np.ndarray, bits_out: np.ndarray, values_out: np.ndarray) -> None:
-        self._run(lambda engine: engine.step(nstep=self._num_substeps), True, bits, ctrl, bits_out, values_out)
+    def _advance(self, bits: np.ndarray, ctrl: np.ndarray, *poses_and_outputs: np.ndarray) -> None:
+        *poses, bits_out, values_out = poses_and_outputs
+        if not poses or poses[1].shape[1] == 3 * self._model.nmocap:
+            calls = [_Call(poses, self._num_substeps, self._last_stage)]
+        else:
+            quat, path = poses
+            stages = [0] * (self._num_substeps - 1) + [self._last_stage]
+            places = np.split(path, self._num_substeps, axis=1)
+            calls = [_Call([quat, pos], 1, stage) for pos, stage in zip(places, stages, strict=True)]
+        self._run(calls, bits, ctrl, bits_out, values_out)
 
-    def _forward(self, bits: np.ndarray, ctrl: np.ndarray, bits_out: np.ndarray, values_out: np.ndarray) -> None:
-        self._run(lambda engine: engine.forward(), False, bits, ctrl, bits_out, values_out)
+    def _forward(self, bits: np.ndarray, ctrl: np.ndarray, *poses_and_outputs: np.ndarray) -> None:
+        *poses, bits_out, values_out = poses_and_outputs
+        self._run([_Call(poses, 0)], bits, ctrl, bits_out, values_out)
 
     def _run(
         self,
-        call: Callable[[Engine], None],
-        moves: bool,
+        calls: Sequence["_Call"],
         bits: np.ndarray,
         ctrl: np.ndarray,
         bits_out: np.ndarray,
@@ -153,12 +166,14 @@ class NativePhysics:
     ) -> None:
         old, new = bits.view(np.float64), bits_out.view(np.float64)
         end = self._num_state
+        failed = np.zeros(len(bits), bool)
         with self._engine(len(bits)) as engine:
             engine.state[:, :end] = old[:, :end]
             engine.state[:, end : end + ctrl.shape[1]] = ctrl
-            failed = _guarded(engine, call)
-            self._write(engine, old if moves else None, new, values_out)
-        if failed is not None:
+            for call in calls:
+                failed |= call(engine)
+            self._write(engine, old if calls[0].num_steps else None, new, values_out)
+        if failed.any():
             new[failed], values_out[failed] = np.nan, np.nan
 
     def _write(self, engine: Engine, old: np.ndarray | None, new: np.ndarray, values: np.ndarray) -> None:
@@ -203,18 +218,31 @@ def host_call(function: Callable[..., None], shapes: Any, *args: jax.Array) -> A
     return jax.pure_callback(by_value, shapes, *args, vmap_method="broadcast_all")
 
 
-def _guarded(engine: Engine, call: Callable[[Engine], None]) -> np.ndarray | None:
-    """Runs `call`; returns which simulations diverged or raised `[num_sims]` bool, None if none did."""
-    failed = None
-    try:
-        call(engine)
-    except SimulationError:
-        failed = engine.status != 0
-    if engine.warning.any():  # rare, and cheaper to ask than to select the kinds each time
-        diverged = np.asarray(engine.warning[:, _DIVERGED, 1].any(axis=1))
-        failed = diverged if failed is None else failed | diverged
-        engine.warning[...] = 0
-    return failed if failed is not None and failed.any() else None
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """Some engine steps with the mocap bodies standing still, or none and the forward pass."""
+
+    poses: Sequence[np.ndarray]  # quat [num_sims, 4 num_mocap] and pos [num_sims, 3 num_mocap], or nothing
+    num_steps: int
+    stage: int = 0
+
+    def __call__(self, engine: Engine) -> np.ndarray | bool:
+        """Which simulations diverged or raised, `[num_sims]`; False if none did."""
+        for name, values in zip(("mocap_quat", "mocap_pos"), self.poses, strict=False):
+            target = engine.bind(name)
+            target[...] = values.reshape(target.shape)
+        failed: np.ndarray | bool = False
+        try:
+            if self.num_steps:
+                engine.step(nstep=self.num_steps, stage=self.stage)
+            else:
+                engine.forward()
+        except SimulationError:
+            failed = engine.status != 0
+        if engine.warning.any():  # rare, and cheaper to ask than to select the kinds each time
+            failed |= np.asarray(engine.warning[:, _DIVERGED, 1].any(axis=1))
+            engine.warning[...] = 0
+        return failed
 
 
 def _columns(names: Sequence[str], shapes: dict[str, Any], start: int = 0) -> tuple[dict[str, slice], int]:

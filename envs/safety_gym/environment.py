@@ -1,0 +1,308 @@
+"""The Safety Gym tasks as environments: layouts, physics and terms put together in safety-gymnasium's order."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax.typing import ArrayLike
+
+from envs import physics as physics_lib
+from envs.base import State
+from envs.physics import Mocap
+from envs.safety_gym import layout as layouts
+from envs.safety_gym import scene as scenes
+from envs.safety_gym.lidar import lidar
+from envs.safety_gym.tasks import TABLE
+from envs.safety_gym.terms import AIMS, COSTS, Situation
+
+BUTTON_PAUSE = 10  # control steps after a right press without button cost and button lidar
+CIRCLE = 0.35  # m, radius of the gremlins' course; they take 2 pi seconds for a round
+FLIGHT = 0.2  # m, height of the gremlins' targets
+
+
+@struct.dataclass(kw_only=True)
+class World:
+    """`State.physics`: the engine's state and what the engine does not know."""
+
+    data: physics_lib.Data
+    layout: jax.Array  # [P, 2] places at reset, of the robot and of every object; a goal's is kept up to date
+    mocap_quat: jax.Array  # [num_mocap, 4]
+    goal_button: jax.Array  # [] int32
+    timer: jax.Array  # [] int32 control steps
+    distances: dict[str, jax.Array]  # [] each: what the next step's reward is counted from
+    ticks: jax.Array  # [] int32 engine steps since reset: the gremlins' clock
+    key: jax.Array  # of the goals to come
+
+
+class SafetyGym:
+    """See `Environment`. As safety-gymnasium 1.0.0's level-1 tasks, observations in its order.
+
+    `State.terms` has the decrease of each distance of the task's aim, "bonus" (1 when it is met) and, for each of the
+    task's costs, "cost_<name>" (0 or 1). `State.cost` is 1 if any of these is.
+
+    Args:
+        name: a key of `tasks.TABLE`.
+        physics: backend; see `envs.make`.
+        max_episode_steps: control steps until truncation.
+        num_threads: of the native backend; None shares the usable CPUs among the local devices.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        physics: str = "auto",
+        max_episode_steps: int = 1000,
+        num_threads: int | None = None,
+    ):
+        self.name = name
+        self.task = task = TABLE[name]
+        self.max_episode_steps = max_episode_steps
+        self.scene = scene = scenes.build(task)
+        self.model = model = scene.model
+        self.dt = float(model.opt.timestep) * scenes.SUBSTEPS
+        self.action_dim = model.nu
+        self.action_low, self.action_high = model.actuator_ctrlrange.astype("float32").T
+        self._kinds = {kind.name: kind for kind in task.objects}
+        self._places = layouts.places_of(task)
+        self._radii = layouts.keepouts(task)
+        self._physics = physics_lib.make_physics(
+            physics,
+            model,
+            num_substeps=scenes.SUBSTEPS,
+            fields=["sensordata"],
+            refresh=True,
+            num_threads=num_threads,
+        )
+        self.physics_name = self._physics.name
+        hinges, ball = 2 * len(scene.hinge_qpos), 9 * (scene.ball_qpos is not None)
+        self.obs_dim = scene.num_observed + hinges + ball + 16 * len(task.lidars)
+
+    def reset(self, key: jax.Array) -> State:
+        """Starts an episode with a layout of its own; `key` is consumed."""
+        layout_key, yaw_key, goal_key, key = jax.random.split(key, 4)
+        layout = layouts.sample(self.task, layout_key)
+        yaws = jax.random.uniform(yaw_key, (len(layout),), maxval=2 * np.pi)
+        goal_button = jnp.zeros((), jnp.int32)
+        if self.task.aim == "button":
+            goal_button = jax.random.randint(goal_key, (), 0, self._kinds["buttons"].count)
+            layout = self._with_goal(layout, layout[self._places["buttons"]][goal_button])
+        qpos, mocap_quat = self._initial_poses(layout, yaws)
+        return self.reset_to(
+            qpos, jnp.zeros(self.model.nv), layout=layout, mocap_quat=mocap_quat, goal_button=goal_button, key=key
+        )
+
+    def reset_to(
+        self,
+        qpos: ArrayLike,
+        qvel: ArrayLike,
+        *,
+        layout: ArrayLike,
+        mocap_quat: ArrayLike,
+        goal_button: ArrayLike = 0,
+        timer: ArrayLike = 0,
+        ticks: ArrayLike = 0,
+        key: jax.Array,
+    ) -> State:
+        """Starts an episode in a given situation.
+
+        Args:
+            qpos: `[nq]`.
+            qvel: `[nv]`.
+            layout: `[P, 2]` places of robot and objects, in the order of `layout.places_of`. The rows of what the
+                engine moves (robot, vases, push box) are where it started and no longer matter.
+            mocap_quat: `[num_mocap, 4]`: the gremlins' own orientations, the identity for all else.
+            goal_button: `[]` int, the button to press.
+            timer: `[]` int, control steps of the pause that a right press has begun.
+            ticks: `[]` int, engine steps since the episode began.
+            key: of the goals to come; consumed.
+        """
+        layout = jnp.asarray(layout, jnp.result_type(float))
+        mocap_quat = jnp.asarray(mocap_quat, layout.dtype)
+        ticks = jnp.asarray(ticks, jnp.int32)
+        mocap = Mocap(pos=self._mocap_path(layout, ticks)[0], quat=mocap_quat) if self.model.nmocap else None
+        world = World(
+            data=self._physics.init(qpos, qvel, mocap),
+            layout=layout,
+            mocap_quat=mocap_quat,
+            goal_button=jnp.asarray(goal_button, jnp.int32),
+            timer=jnp.asarray(timer, jnp.int32),
+            distances={},
+            ticks=ticks,
+            key=key,
+        )
+        world = dataclasses.replace(world, distances=AIMS[self.task.aim].distances(self.situation(world)))
+        zero = jnp.zeros((), layout.dtype)
+        terms = [*world.distances, "bonus", *(f"cost_{name}" for name in self.task.costs)]
+        return State(
+            physics=world,
+            obs=self.observe(world),
+            reward=zero,
+            cost=zero,
+            terminated=jnp.zeros((), bool),
+            truncated=jnp.zeros((), bool),
+            step_count=jnp.zeros((), jnp.int32),
+            episode_return=zero,
+            episode_cost=zero,
+            terms=dict.fromkeys(terms, zero),
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advances one control step. See `Environment.step`."""
+        aim, world = AIMS[self.task.aim], state.physics
+        world = self._advance(world, jnp.clip(action, self.action_low, self.action_high))
+        situation = self.situation(world)
+        distances, met = aim.distances(situation), aim.met(situation)
+        terms = {name: world.distances[name] - distances[name] for name in distances}
+        terms["bonus"] = met.astype(state.reward.dtype)
+        reward = sum(terms.values(), start=jnp.zeros_like(state.reward))
+        charged = {name: COSTS[name](situation) for name in self.task.costs}
+        cost = jnp.stack(list(charged.values())).any().astype(state.cost.dtype)
+        world = self._aim_anew(world, met)
+        obs = self.observe(world)
+        finite = jnp.isfinite(obs).all() & jnp.isfinite(reward)
+        reward, cost = jnp.where(finite, reward, 0.0), jnp.where(finite, cost, 0.0)
+        step_count = state.step_count + 1
+        return State(
+            physics=world,
+            obs=jnp.where(jnp.isfinite(obs), obs, 0.0),
+            reward=reward,
+            cost=cost,
+            terminated=~finite,
+            truncated=step_count >= self.max_episode_steps,
+            step_count=step_count,
+            episode_return=state.episode_return + reward,
+            episode_cost=state.episode_cost + cost,
+            terms=terms | {f"cost_{name}": value.astype(reward.dtype) for name, value in charged.items()},
+        )
+
+    def _advance(self, world: World, ctrl: jax.Array) -> World:
+        """The world after the engine's substeps: nothing else has changed yet."""
+        mocap = None
+        if self.model.nmocap:
+            path = self._mocap_path(world.layout, world.ticks)
+            mocap = Mocap(pos=path if self._circling else path[0], quat=world.mocap_quat)
+        data = self._physics.step(world.data, ctrl, mocap)
+        return dataclasses.replace(world, data=data, ticks=world.ticks + scenes.SUBSTEPS)
+
+    def _aim_anew(self, world: World, met: jax.Array) -> World:
+        """After the step: the pause runs on; if the aim was met, the next goal and its distances."""
+        key, goal_key = jax.random.split(world.key)
+        timer = jnp.maximum(world.timer - 1, 0)
+        goal_button = world.goal_button
+        if self.task.aim == "button":
+            drawn = jax.random.randint(goal_key, (), 0, self._kinds["buttons"].count)
+            goal_button = jnp.where(met, drawn, goal_button)
+            timer = jnp.where(met, BUTTON_PAUSE, timer)
+            goal = world.layout[self._places["buttons"]][goal_button]
+        else:
+            goal = jnp.where(met, self._draw_goal(world, goal_key), world.layout[self._places["goal"]][0])
+        world = dataclasses.replace(
+            world, layout=self._with_goal(world.layout, goal), goal_button=goal_button, timer=timer, key=key
+        )
+        return dataclasses.replace(world, distances=AIMS[self.task.aim].distances(self.situation(world)))
+
+    def _draw_goal(self, world: World, key: jax.Array) -> jax.Array:
+        """[2]: uniform on what robot and objects, where they are now, leave free."""
+        now = world.layout.at[0].set(self._robot_pose(world.data)[0][:2])
+        for name in self.scene.free_qpos:
+            now = now.at[self._places[name]].set(self._centres(world, name)[:, :2])
+        others = np.delete(np.arange(len(self._radii)), self._places["goal"].start)
+        row = self._places["goal"].start
+        return layouts.draw_goal(key, now[row], float(self._radii[row]), now[others], self._radii[others])
+
+    def _with_goal(self, layout: jax.Array, goal: jax.Array) -> jax.Array:
+        return layout.at[self._places["goal"]].set(goal)
+
+    @property
+    def _circling(self) -> bool:
+        return any(kind.circling for kind in self.task.objects)
+
+    def _mocap_path(self, layout: jax.Array, ticks: jax.Array) -> jax.Array:
+        """[SUBSTEPS, num_mocap, 3]: where the mocap bodies are in each of the substeps from `ticks` on."""
+        angle = (ticks + jnp.arange(scenes.SUBSTEPS)) * self.model.opt.timestep
+        course = CIRCLE * jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=1)
+        path = jnp.zeros((scenes.SUBSTEPS, self.model.nmocap, 3), layout.dtype)
+        for name, rows in self.scene.mocap.items():
+            kind, centres = self._kinds[name], layout[self._places[name]]
+            places = centres + course[:, None] if kind.circling else centres + 0 * course[:, None]
+            path = path.at[:, rows, :2].set(places).at[:, rows, 2].set(FLIGHT if kind.circling else kind.height)
+        return path
+
+    def _initial_poses(self, layout: jax.Array, yaws: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """qpos `[nq]` and mocap_quat `[num_mocap, 4]`: all upright, each at its place and turned by its yaw."""
+        qpos = jnp.asarray(self.model.qpos0, layout.dtype)
+        if self.scene.robot.planar:
+            qpos = qpos.at[:3].set(jnp.array([*layout[0], yaws[0]]))
+        else:
+            qpos = qpos.at[:2].set(layout[0]).at[3:7].set(_turned(yaws[0]))
+        mocap_quat = jnp.zeros((self.model.nmocap, 4), layout.dtype).at[:, 0].set(1.0)
+        for name, starts in self.scene.free_qpos.items():
+            quats = jax.vmap(_turned)(yaws[self._places[name]])
+            qpos = qpos.at[starts[:, None] + np.arange(2)].set(layout[self._places[name]])
+            qpos = qpos.at[starts[:, None] + np.arange(3, 7)].set(quats)
+            if self._kinds[name].circling:
+                mocap_quat = mocap_quat.at[self.scene.mocap[name]].set(quats)
+        return qpos, mocap_quat
+
+    def _robot_pose(self, data: physics_lib.Data) -> tuple[jax.Array, jax.Array]:
+        """Position [3] and rotation [3, 3] of the root body."""
+        if self.scene.robot.planar:
+            pos = jnp.append(data.qpos[:2], self.scene.robot.height)
+            sine, cosine = jnp.sin(data.qpos[2]), jnp.cos(data.qpos[2])
+            return pos, jnp.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return data.qpos[:3], _rotation(data.qpos[3:7])
+
+    def _centres(self, world: World, name: str) -> jax.Array:
+        """[count, 3]: of a kind, wherever its places are kept."""
+        if name in self.scene.free_qpos:
+            return world.data.qpos[self.scene.free_qpos[name][:, None] + np.arange(3)]
+        places = world.layout[self._places[name]]
+        return jnp.concatenate([places, jnp.full_like(places[:, :1], self._kinds[name].height)], axis=1)
+
+    def situation(self, world: World) -> Situation:
+        contacts = world.data.fields["sensordata"]
+        centres = {name: self._centres(world, name) for name in self._kinds}
+        return Situation(
+            robot=self._robot_pose(world.data)[0],
+            objects=centres,
+            sizes={name: kind.size for name, kind in self._kinds.items()},
+            goal=centres["goal"][0],
+            goal_button=world.goal_button,
+            timer=world.timer,
+            touched={name: contacts[entries] > 0 for name, entries in self.scene.contacts.items()},
+        )
+
+    def observe(self, world: World) -> jax.Array:
+        """`[obs_dim]`: sensors, the ball's rotation, the hinges' angles, one lidar for each kind."""
+        scene, qpos = self.scene, world.data.qpos
+        pos, rotation = self._robot_pose(world.data)
+        parts = [world.data.fields["sensordata"][: scene.num_observed]]
+        if scene.ball_qpos is not None:
+            parts.append(_rotation(qpos[scene.ball_qpos : scene.ball_qpos + 4]).ravel())
+        if len(scene.hinge_qpos):
+            angles = qpos[scene.hinge_qpos]
+            parts.append(jnp.stack([jnp.sin(angles), jnp.cos(angles)], axis=1).ravel())
+        for name in self.task.lidars:
+            seen = lidar(pos, rotation, self._centres(world, name)[:, :2])
+            parts.append(jnp.where(world.timer == 0, seen, 0.0) if name == "buttons" else seen)
+        return jnp.concatenate(parts)
+
+
+def _turned(yaw: jax.Array) -> jax.Array:
+    """The quaternion of a turn about the vertical."""
+    return jnp.array([jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2)])
+
+
+def _rotation(quat: jax.Array) -> jax.Array:
+    """[3, 3] of a quaternion (w, x, y, z) of any length."""
+    w, x, y, z = quat / jnp.sqrt(jnp.sum(jnp.square(quat)))
+    return jnp.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

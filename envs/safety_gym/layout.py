@@ -1,0 +1,112 @@
+"""Random layouts: where robot and objects stand at the start of an episode, and where the next goal is.
+
+safety-gymnasium draws object after object uniformly from the arena until one is far enough from those before it, up to
+100 times, and starts the whole layout anew where that fails. The first valid one of that many independent candidates
+has the same distribution, and all candidates are drawn at once.
+"""
+
+import functools
+from collections.abc import Sequence
+from importlib import resources
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from envs.safety_gym.tasks import ARENA, ROBOT_KEEPOUT, SafetyGymTask
+
+NUM_CANDIDATES = 100  # per object, as in safety-gymnasium
+NUM_GOAL_CANDIDATES = 512  # of a new goal; safety-gymnasium would go on to 10,000, and has needed 97 at most
+
+
+def keepouts(task: SafetyGymTask) -> np.ndarray:
+    """[P] radii of the robot and of every object, in the order of placement."""
+    return np.array([ROBOT_KEEPOUT, *(kind.keepout for kind in task.objects for _ in range(kind.count))])
+
+
+def places_of(task: SafetyGymTask) -> dict[str, slice]:
+    """Which rows of a layout belong to the robot and to each kind of object."""
+    slices, start = {"robot": slice(0, 1)}, 1
+    for kind in task.objects:
+        slices[kind.name] = slice(start, start + kind.count)
+        start += kind.count
+    return slices
+
+
+def candidates(key: jax.Array, keepout: float, count: int) -> Float[Array, "C 2"]:
+    """Centres such that the whole keepout lies within the arena. `key` is consumed."""
+    reach = ARENA - keepout
+    return jax.random.uniform(key, (count, 2), minval=-reach, maxval=reach)
+
+
+def is_clear(
+    points: Float[Array, "C 2"],
+    keepout: float,
+    others: Float[Array, "P 2"],
+    other_keepouts: Sequence[float] | np.ndarray,
+) -> Bool[Array, " C"]:
+    """Which points are at least the sum of both keepouts away from all others."""
+    distance = jnp.linalg.norm(points[:, None] - others[None], axis=-1)
+    return (distance >= keepout + jnp.asarray(other_keepouts)).all(axis=1)
+
+
+def first_clear(points: Float[Array, "C 2"], clear: Bool[Array, " C"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
+    """The first clear point, and whether there is one (otherwise the first point of all)."""
+    return points[jnp.argmax(clear)], clear.any()
+
+
+def attempt(key: jax.Array, radii: Sequence[float]) -> tuple[Float[Array, "P 2"], Bool[Array, ""]]:
+    """One attempt at a layout: a place for each object in turn, and whether all found one. `key` is consumed."""
+    first_key, *keys = jax.random.split(key, len(radii))
+    placed = candidates(first_key, radii[0], 1)
+    complete = jnp.ones((), bool)
+    for i, key in enumerate(keys, start=1):
+        points = candidates(key, radii[i], NUM_CANDIDATES)
+        place, found = first_clear(points, is_clear(points, radii[i], placed, radii[:i]))
+        placed = jnp.concatenate([placed, place[None]])
+        complete &= found
+    return placed, complete
+
+
+def sample(task: SafetyGymTask, key: jax.Array) -> Float[Array, "P 2"]:
+    """Places of the robot and of every object, in the order of `places_of`. `key` is consumed."""
+    layout_key, goal_key = jax.random.split(key)
+    radii = keepouts(task)
+    if task.aim == "button":
+        return from_bank(layout_key)
+    layout, _ = attempt(layout_key, radii)
+    # The goal is drawn once more, against everything else, as it will be when it is met.
+    row = places_of(task)["goal"].start
+    others = np.delete(np.arange(len(radii)), row)
+    return layout.at[row].set(draw_goal(goal_key, layout[row], float(radii[row]), layout[others], radii[others]))
+
+
+def from_bank(key: jax.Array) -> Float[Array, "P 2"]:
+    """A layout of the bank, mirrored and turned into one of its eight images under the square's symmetries."""
+    bank = load_bank()
+    row_key, image_key = jax.random.split(key)
+    layout = jnp.asarray(bank)[jax.random.randint(row_key, (), 0, len(bank))]
+    flips = jax.random.randint(image_key, (3,), 0, 2)
+    signs = 1.0 - 2.0 * flips[:2]
+    return signs * jnp.where(flips[2] == 0, layout, layout[:, ::-1])
+
+
+@functools.cache
+def load_bank() -> np.ndarray:
+    """[B, 14, 2] float32: valid layouts of the Button1 tasks, made by `python -m envs.safety_gym.bank`.
+
+    One attempt in 70 succeeds there, so drawing at every reset would wait for the unluckiest simulation.
+    """
+    with resources.files("envs.safety_gym").joinpath("button_layouts.npy").open("rb") as file:
+        bank: np.ndarray = np.load(file, allow_pickle=False)
+    return bank
+
+
+def draw_goal(
+    key: jax.Array, old_goal: Float[Array, "2"], keepout: float, others: Float[Array, "P 2"], radii: np.ndarray
+) -> Float[Array, "2"]:
+    """A goal uniform on what the others leave free; the old one should nothing be free. `key` is consumed."""
+    points = candidates(key, keepout, NUM_GOAL_CANDIDATES)
+    place, found = first_clear(points, is_clear(points, keepout, others, radii))
+    return jnp.where(found, place, old_goal)

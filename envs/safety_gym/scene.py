@@ -1,0 +1,172 @@
+"""One compiled model per task: the robot, the floor and what can be touched. All else is analytic.
+
+What stands still within an episode but elsewhere in the next (buttons, pillar) is a mocap body, so that one model
+serves every layout: a mocap body acts on others through contact alone, as a fixed one does. Each gremlin is welded to
+a mocap target, which the environment leads round.
+
+Pruned against safety-gymnasium: gremlins touch the robot alone. There, they also touch each other, buttons and the
+floor, but only while the robot shoves them (their places are 0.8 m apart and they circle in step, 0.1 m above the
+floor) and in the first steps, as they rise from it. The Point robot does not touch the floor: its sphere rests on it
+at distance 0 without vertical freedom, and there the contact never acts.
+"""
+
+import dataclasses
+
+import mujoco
+import numpy as np
+
+from envs.safety_gym.robots import ROBOTS, Robot, Style
+from envs.safety_gym.tasks import ObjectKind, SafetyGymTask
+
+GEOM, SENSOR, OBJECT = mujoco.mjtGeom, mujoco.mjtSensor, mujoco.mjtObj
+SUBSTEPS = 10  # engine steps per control step
+
+# Collision classes: bits of contype. Two geoms can touch if either names the other's class in its conaffinity.
+FLOOR, ROBOT, MOVABLE, FIXED, GREMLIN = (1 << i for i in range(5))
+
+_BASIC_SENSORS = (
+    ("accelerometer", SENSOR.mjSENS_ACCELEROMETER),
+    ("velocimeter", SENSOR.mjSENS_VELOCIMETER),
+    ("gyro", SENSOR.mjSENS_GYRO),
+    ("magnetometer", SENSOR.mjSENS_MAGNETOMETER),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A compiled task and where its parts are."""
+
+    model: mujoco.MjModel
+    robot: Robot
+    free_qpos: dict[str, np.ndarray]  # kind -> [count] first of the seven qpos entries of each free body
+    mocap: dict[str, np.ndarray]  # kind -> [count] rows of mocap_pos
+    ball_qpos: int | None  # first qpos entry of the robot's observed ball joint
+    hinge_qpos: np.ndarray  # [H] qpos entries of the observed hinges
+    num_observed: int  # leading entries of sensordata that are observed as they are
+    contacts: dict[str, slice]  # kind -> entries of sensordata: number of contacts with the robot
+
+
+def build(task: SafetyGymTask) -> Scene:
+    """Compiles the model of a task."""
+    robot = ROBOTS[task.robot]
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep = robot.timestep
+    _set_geom_defaults(spec)
+    spec.worldbody.add_geom(name="floor", type=GEOM.mjGEOM_PLANE, size=[3.5, 3.5, 0.1], contype=FLOOR, conaffinity=0)
+    _add_robot(spec, robot)
+    for kind in task.objects:
+        for i in range(kind.count if kind.shape != "none" else 0):
+            _add_object(spec, kind, i)
+    num_observed = _add_sensors(spec, robot)
+    touched = [kind for kind in task.objects if kind.name in task.costs and kind.shape != "none"]
+    for kind in touched:
+        for i in range(kind.count):
+            spec.add_sensor(
+                name=f"contact_{kind.name}_{i}",
+                type=SENSOR.mjSENS_CONTACT,
+                objtype=OBJECT.mjOBJ_GEOM,
+                objname=f"{kind.name}_{i}",
+                intprm=[1, 0, 1],  # the number of contacts found, unsorted, one row
+            )
+    model = spec.compile()
+    return Scene(
+        model=model,
+        robot=robot,
+        free_qpos={
+            kind.name: np.array([_qpos_address(model, f"{kind.name}_{i}") for i in range(kind.count)])
+            for kind in task.objects
+            if kind.free
+        },
+        mocap={
+            kind.name: np.array([model.body(_mocap_name(kind, i)).mocapid[0] for i in range(kind.count)])
+            for kind in task.objects
+            if _mocap_name(kind, 0)
+        },
+        ball_qpos=_qpos_address(model, robot.ball) if robot.ball else None,
+        hinge_qpos=np.array([_qpos_address(model, name) for name in robot.hinges], int),
+        num_observed=num_observed,
+        contacts={
+            kind.name: slice(first := int(model.sensor(f"contact_{kind.name}_0").adr[0]), first + kind.count)
+            for kind in touched
+        },
+    )
+
+
+def _mocap_name(kind: ObjectKind, index: int) -> str:
+    """The mocap body that goes with an object: its target, itself where it stands still, none where it is free."""
+    if kind.circling:
+        return f"{kind.name}_{index}_target"
+    return "" if kind.free or kind.shape == "none" else f"{kind.name}_{index}"
+
+
+def _qpos_address(model: mujoco.MjModel, joint: str) -> int:
+    return int(model.joint(joint).qposadr[0])
+
+
+def _set_geom_defaults(spec: mujoco.MjSpec) -> None:
+    geom = spec.default.geom
+    geom.condim = 6
+    geom.friction = [1, 0.005, 0.0001]
+
+
+def _add_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+    root = spec.worldbody.add_body(name="robot", pos=[0, 0, robot.height])
+    root.add_site(name="robot")
+    touches = MOVABLE | FIXED | GREMLIN
+    if not robot.planar:
+        touches |= FLOOR
+    if robot.name == "Doggo":  # its legs can meet
+        touches |= ROBOT
+    robot.build(root, Style(contype=ROBOT, conaffinity=touches))
+    robot.actuate(spec)
+    for actuator in spec.actuators:
+        actuator.ctrlrange = [-1, 1]
+        actuator.ctrllimited = True
+
+
+def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int) -> None:
+    name = f"{kind.name}_{index}"
+    body = spec.worldbody.add_body(name=name, pos=[0, 0, kind.height], mocap=not kind.free)
+    if kind.free:
+        body.add_freejoint(name=name)
+    if kind.circling:
+        spec.worldbody.add_body(name=f"{name}_target", pos=[0, 0, kind.height], mocap=True)
+        spec.add_equality(
+            name=name,
+            type=mujoco.mjtEq.mjEQ_WELD,
+            objtype=OBJECT.mjOBJ_BODY,
+            name1=f"{name}_target",
+            name2=name,
+            solref=[0.02, 1.5],
+            data=[0, 0, 0] + [0, 0, 0] + [1, 0, 0, 0] + [1, 0],  # anchor, relative pose (none), torque scale
+        )
+    if kind.circling:
+        classes = {"contype": GREMLIN, "conaffinity": 0}
+    elif kind.free:
+        classes = {"contype": MOVABLE, "conaffinity": FLOOR | FIXED}
+    else:
+        classes = {"contype": FIXED, "conaffinity": 0}
+    settings = classes | {"density": kind.density}
+    if kind.shape == "box":
+        body.add_geom(name=name, type=GEOM.mjGEOM_BOX, size=[kind.size] * 3, **settings)
+    elif kind.shape == "sphere":
+        body.add_geom(name=name, type=GEOM.mjGEOM_SPHERE, size=[kind.size, 0, 0], **settings)
+    elif kind.shape == "cylinder":
+        body.add_geom(name=name, type=GEOM.mjGEOM_CYLINDER, size=[kind.size, kind.height, 0], **settings)
+    elif kind.shape == "push_box":
+        s = kind.size
+        body.add_geom(name=name, type=GEOM.mjGEOM_BOX, size=[s, s, s], **settings)
+        for x in (-s, s):
+            for y in (-s, s):
+                body.add_geom(type=GEOM.mjGEOM_BOX, size=[s / 2, s / 2, s], pos=[x, y, 0], **settings)
+
+
+def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> int:
+    """Every robot's and this robot's own sensors, in the order of the observation; how many numbers they give."""
+    for name, kind in _BASIC_SENSORS:
+        spec.add_sensor(name=name, type=kind, objtype=OBJECT.mjOBJ_SITE, objname="robot")
+    for name, kind, objtype, target in robot.sensors:
+        spec.add_sensor(name=name, type=kind, objtype=objtype, objname=target)
+    width = {SENSOR.mjSENS_TOUCH: 1, SENSOR.mjSENS_JOINTVEL: 1, SENSOR.mjSENS_BALLANGVEL: 3}
+    return 3 * len(_BASIC_SENSORS) + sum(width[kind] for _, kind, _, _ in robot.sensors)

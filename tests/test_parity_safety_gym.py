@@ -1,0 +1,168 @@
+"""Safety Gym tasks against states that safety-gymnasium 1.0.0 recorded (`tests/golden/record_safety_gym.py`).
+
+All in float64: from the original's state after a control step, our functions give its observation, reward and cost.
+"""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from envs import physics
+from envs.safety_gym import environment, layout
+from envs.safety_gym.environment import SafetyGym, World
+from envs.safety_gym.tasks import TABLE
+from envs.safety_gym.terms import AIMS, COSTS
+
+FOLDER = Path(__file__).parent / "golden" / "safety_gym"
+LAST_DISTANCES = {  # aim -> our name of a distance -> the recorder's
+    "goal": {"goal_distance": "last_dist_goal"},
+    "button": {"goal_distance": "last_dist_goal"},
+    "push": {"box_distance": "last_dist_box", "goal_distance": "last_box_goal"},
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What the original did, in our coordinates; [R] records."""
+
+    env: SafetyGym
+    data: dict[str, np.ndarray]
+    qpos: np.ndarray  # [R, nq] before the step
+    qvel: np.ndarray
+    next_qpos: np.ndarray  # [R, nq] after the step
+    next_qvel: np.ndarray
+    layout: np.ndarray  # [R, P, 2] with the goal in force during the step
+    next_layout: np.ndarray
+    mocap_quat: np.ndarray  # [R, num_mocap, 4]
+
+
+@pytest.fixture(scope="module", params=list(TABLE))
+def recording(request: pytest.FixtureRequest) -> Recording:
+    with jax.enable_x64(True):
+        env = SafetyGym(request.param, physics="native", num_threads=1)
+    with np.load(FOLDER / f"{request.param}.npz", allow_pickle=False) as file:
+        data = {name: file[name] for name in file.files}
+    return convert(env, data)
+
+
+def convert(env: SafetyGym, data: dict[str, np.ndarray]) -> Recording:
+    """The original's coordinates into ours: the Point's joints are relative to where it started, its objects follow."""
+    episode = data["episode"]
+    poses = {name: ours(env, data, data[name], episode) for name in ("qpos", "next_qpos")}
+    speeds = {name: data[name].copy() for name in ("qvel", "next_qvel")}
+    if env.scene.robot.planar:
+        for name, speed in speeds.items():
+            speed[:, :2] = turn(data["robot_init"][episode, 2], data[name][:, :2])
+    places = np.zeros((len(episode), len(layout.keepouts(env.task)), 2))
+    rows = layout.places_of(env.task)
+    for name in ("hazards", "buttons", "gremlins", "pillars"):
+        if name in rows:
+            places[:, rows[name]] = data[f"layout_{name}"][episode][..., :2]
+    before, after = places.copy(), places.copy()
+    before[:, rows["goal"]] = data["goal_pos"][:, None, :2]
+    after[:, rows["goal"]] = data["next_goal_pos"][:, None, :2]
+    quat = np.tile([1.0, 0, 0, 0], (len(episode), env.model.nmocap, 1))
+    if "gremlins" in rows:
+        quat[:, env.scene.mocap["gremlins"]] = data["gremlin_quat"][episode]
+    return Recording(env=env, data=data, **poses, **speeds, layout=before, next_layout=after, mocap_quat=quat)
+
+
+def ours(env: SafetyGym, data: dict[str, np.ndarray], qpos: np.ndarray, episode: np.ndarray) -> np.ndarray:
+    qpos = qpos.copy()
+    if env.scene.robot.planar:
+        start = data["robot_init"][episode]
+        qpos[:, :2] = start[:, :2] + turn(start[:, 2], qpos[:, :2])
+        qpos[:, 2] += start[:, 2]
+    return qpos
+
+
+def turn(angle: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    sine, cosine = np.sin(angle), np.cos(angle)
+    x, y = vectors.T
+    return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1)
+
+
+def worlds(recording: Recording) -> World:
+    """[R] worlds after the step, the goal still the one in force during it; sensors by C MuJoCo's forward pass."""
+    env, data, count = recording.env, recording.data, len(recording.qpos)
+    simulation, sensors = mujoco.MjData(env.model), np.zeros((count, env.model.nsensordata))
+    ticks = np.round(data["next_time"] / env.model.opt.timestep).astype(np.int32)
+    for i in range(count):
+        simulation.qpos[:], simulation.qvel[:] = recording.next_qpos[i], recording.next_qvel[i]
+        simulation.ctrl[:] = np.clip(data["action"][i], -1, 1)
+        if env.model.nmocap:
+            path = np.asarray(env._mocap_path(jnp.asarray(recording.layout[i]), ticks[i] - 10))
+            simulation.mocap_pos[:], simulation.mocap_quat[:] = path[-1], recording.mocap_quat[i]
+        simulation.qacc_warmstart[:] = 0
+        mujoco.mj_forward(env.model, simulation)
+        sensors[i] = simulation.sensordata
+    return World(
+        data=physics.Data(
+            qpos=jnp.asarray(recording.next_qpos),
+            qvel=jnp.asarray(recording.next_qvel),
+            fields={"sensordata": jnp.asarray(sensors)},
+            change={},
+            backend=jnp.zeros(count),
+        ),
+        layout=jnp.asarray(recording.layout),
+        mocap_quat=jnp.asarray(recording.mocap_quat),
+        goal_button=jnp.asarray(data["goal_button"]),
+        timer=jnp.asarray(data["timer"]),
+        distances={ours: jnp.asarray(data[theirs]) for ours, theirs in LAST_DISTANCES[env.task.aim].items()},
+        ticks=jnp.asarray(ticks),
+        key=jnp.zeros(count),
+    )
+
+
+def test_observations_reward_cost_and_goals_from_recorded_states(recording: Recording) -> None:
+    with jax.enable_x64(True):
+        env, data = recording.env, recording.data
+        world = worlds(recording)
+        situation = jax.vmap(env.situation)(world)
+        aim = AIMS[env.task.aim]
+        distances, met = jax.vmap(aim.distances)(situation), np.asarray(jax.vmap(aim.met)(situation))
+        reward = sum(np.asarray(world.distances[name] - distances[name]) for name in distances) + met
+        charged: dict[str, Any] = {name: np.asarray(jax.vmap(COSTS[name])(situation)) for name in env.task.costs}
+        after = dataclasses.replace(
+            world,
+            layout=jnp.asarray(recording.next_layout),
+            goal_button=jnp.asarray(data["next_goal_button"]),
+            timer=jnp.asarray(data["next_timer"]),
+        )
+        obs = np.asarray(jax.vmap(env.observe)(after))
+    np.testing.assert_array_equal(met, data["goal_met"])
+    np.testing.assert_allclose(reward, data["reward"], rtol=1e-5, atol=1e-9)
+    for name, value in charged.items():
+        recorded = np.nan_to_num(data[f"cost_{name}"])
+        np.testing.assert_array_equal(value, recorded > 0, err_msg=name)
+    np.testing.assert_array_equal(np.any(list(charged.values()), axis=0), data["cost"])
+    assert obs.shape == data["obs"].shape
+    np.testing.assert_allclose(obs[:, env.scene.num_observed :], data["obs"][:, env.scene.num_observed :], atol=1e-9)
+    free = ~data["any_object_contact"]
+    np.testing.assert_allclose(obs[free][:, 3:12], data["obs"][free][:, 3:12], rtol=1e-5, atol=1e-9)
+    error = np.abs(obs - data["obs"])[:, : env.scene.num_observed]
+    for n in range(0, error.shape[1], 3):
+        print(
+            env.name,
+            n,
+            "free:",
+            np.quantile(error[free][:, n : n + 3], [0.5, 0.9, 0.99, 1.0]).round(5),
+            "all:",
+            np.quantile(error[:, n : n + 3], [0.5, 0.9, 0.99, 1.0]).round(5),
+        )
+
+
+def test_metadata_say_where_the_recordings_are_from() -> None:
+    for name in TABLE:
+        with np.load(FOLDER / f"{name}.npz", allow_pickle=False) as file:
+            facts = json.loads(str(file["metadata"]))
+        assert facts["versions"]["safety-gymnasium"] == "1.0.0"
+        assert facts["task"] == f"Safety{name}-v0"
+    assert environment.BUTTON_PAUSE == 10
