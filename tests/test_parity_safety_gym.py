@@ -147,16 +147,36 @@ def test_observations_reward_cost_and_goals_from_recorded_states(recording: Reco
     np.testing.assert_allclose(obs[:, env.scene.num_observed :], data["obs"][:, env.scene.num_observed :], atol=1e-9)
     free = ~data["any_object_contact"]
     np.testing.assert_allclose(obs[free][:, 3:12], data["obs"][free][:, 3:12], rtol=1e-5, atol=1e-9)
-    error = np.abs(obs - data["obs"])[:, : env.scene.num_observed]
-    for n in range(0, error.shape[1], 3):
-        print(
-            env.name,
-            n,
-            "free:",
-            np.quantile(error[free][:, n : n + 3], [0.5, 0.9, 0.99, 1.0]).round(5),
-            "all:",
-            np.quantile(error[:, n : n + 3], [0.5, 0.9, 0.99, 1.0]).round(5),
-        )
+
+
+# Of the robot's velocity after a control step without contacts between objects: median, 90 %, 99 %. The original ran
+# MuJoCo 2.3.3 from its own warm start: where solver tolerance counts, 3.17 and it part (specification, section 12).
+BOUNDS = {"Point": (1e-12, 1e-10, 1e-2), "Car": (1e-11, 1e-3, 4.0), "Doggo": (1e-10, 1e-8, 1e-3)}
+
+
+def test_one_control_step_without_contacts_between_objects(recording: Recording) -> None:
+    env, data = recording.env, recording.data
+    free = ~data["any_object_contact"]
+    if "gremlin_floor_contact" in data:  # pruned here: gremlins rise from the floor in the first steps
+        free &= ~data["gremlin_floor_contact"]
+    assert free.sum() > 150
+    with jax.enable_x64(True):
+        ticks = np.round(data["time"] / env.model.opt.timestep).astype(np.int32)
+
+        def step(qpos: Any, qvel: Any, layout: Any, quat: Any, ticks: Any, action: Any) -> tuple[Any, Any]:
+            start = env.reset_to(qpos, qvel, layout=layout, mocap_quat=quat, ticks=ticks, key=jax.random.key(0))
+            data = env.step(start, action).physics.data
+            return data.qpos, data.qvel
+
+        chosen = [
+            jnp.asarray(x[free])
+            for x in (recording.qpos, recording.qvel, recording.layout, recording.mocap_quat, ticks, data["action"])
+        ]
+        _, qvel = jax.jit(jax.vmap(step))(*chosen)
+    robot = slice(0, env.model.nv - 6 * sum(map(len, env.scene.free_qpos.values())))
+    error = np.abs(np.asarray(qvel) - recording.next_qvel[free])[:, robot].max(axis=1)
+    quantiles = np.quantile(error, [0.5, 0.9, 0.99])
+    assert (quantiles <= BOUNDS[env.scene.robot.name]).all(), quantiles
 
 
 def test_metadata_say_where_the_recordings_are_from() -> None:

@@ -14,8 +14,9 @@ class Data:
     """One simulation between two control steps.
 
     Derived `fields` are what the engine leaves after a step, as in MuJoCo itself: one substep behind `qpos` and
-    `qvel` (with RK4, of its last stage), unless the backend was made with `refresh`. `change` has the tracked quantities after the control step minus before,
-    taken at the engine's precision: at x = 100 m a float32 difference of positions would keep no more than 1e-5 m.
+    `qvel` (with RK4, of its last stage), unless the backend was made with `refresh`. `change` has the tracked
+    quantities after the control step minus before, taken at the engine's precision: at x = 100 m a float32 difference
+    of positions would keep no more than 1e-5 m.
     """
 
     qpos: jax.Array  # [nq]

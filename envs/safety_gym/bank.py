@@ -1,4 +1,4 @@
-"""Makes the bank of Button1 layouts: `python -m envs.safety_gym.bank` rewrites `button_layouts.npy` beside this file."""
+"""Makes the bank of Button1 layouts: `python -m envs.safety_gym.bank` rewrites `button_layouts.npy` beside it."""
 
 import argparse
 from pathlib import Path

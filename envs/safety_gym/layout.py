@@ -75,7 +75,7 @@ def sample(task: SafetyGymTask, key: jax.Array) -> Float[Array, "P 2"]:
     radii = keepouts(task)
     if task.aim == "button":
         return from_bank(layout_key)
-    layout, _ = attempt(layout_key, radii)
+    layout, _ = attempt(layout_key, radii.tolist())
     # The goal is drawn once more, against everything else, as it will be when it is met.
     row = places_of(task)["goal"].start
     others = np.delete(np.arange(len(radii)), row)

@@ -139,7 +139,7 @@ def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int) -> None:
             name1=f"{name}_target",
             name2=name,
             solref=[0.02, 1.5],
-            data=[0, 0, 0] + [0, 0, 0] + [1, 0, 0, 0] + [1, 0],  # anchor, relative pose (none), torque scale
+            data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0],  # anchor [3], relative position [3] and turn [4], torque scale
         )
     if kind.circling:
         classes = {"contype": GREMLIN, "conaffinity": 0}
