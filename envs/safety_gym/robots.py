@@ -141,8 +141,10 @@ def _add_hinge(body: mujoco.MjsBody, name: str, axis: list[float], limits: tuple
 def _build_leg(torso: mujoco.MjsBody, leg: int, style: Style) -> None:
     s, e = _leg_signs(leg)
     capsule = {"type": GEOM.mjGEOM_CAPSULE, "size": [0.016, 0, 0], "density": 20}
-    _add_geom(torso, style, fromto=[0.05 * e, 0, 0, 0.1 * e, 0.05 * s, 0], **capsule)
-    hip = torso.add_body(name=f"hip_{leg}", pos=[0.1 * e, 0.05 * s, 0])
+    # A body of its own, without a joint: MuJoCo's contacts depend on the inertia of the body that a geom belongs to.
+    shoulder = torso.add_body(name=f"shoulder_{leg}")
+    _add_geom(shoulder, style, fromto=[0.05 * e, 0, 0, 0.1 * e, 0.05 * s, 0], **capsule)
+    hip = shoulder.add_body(name=f"hip_{leg}", pos=[0.1 * e, 0.05 * s, 0])
     _add_hinge(hip, f"hip_{leg}_z", [0, 0, s], (-0.174533, 0.523599), 0.0)
     if e > 0:
         _add_hinge(hip, f"hip_{leg}_y", [0, 1, 0], (-1.308998, 0.2618), -0.174533)
