@@ -3,6 +3,7 @@
 Importing this package imports neither JAX nor an engine (PEP 562): launchers answer `--help` at once.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 from envs.registry import PHYSICS, TASKS, TaskInfo
@@ -12,6 +13,11 @@ if TYPE_CHECKING:
 
 __all__ = ["PHYSICS", "TASKS", "Environment", "State", "TaskInfo", "make"]
 
+_FAMILIES = {
+    "locomotion": ("envs.locomotion", "Locomotion"),
+    "safety_gym": ("envs.safety_gym.environment", "SafetyGym"),
+}
+
 
 def make(name: str, physics: str = "auto", **options: Any) -> "Environment":
     """Builds a task.
@@ -20,7 +26,7 @@ def make(name: str, physics: str = "auto", **options: Any) -> "Environment":
         name: a key of `TASKS`.
         physics: "native" (C MuJoCo on threads), "mjx" (MJX-JAX), "warp" (MJX-Warp) or "auto": native where JAX runs
             on a CPU, mjx on an accelerator.
-        **options: the family's own: `cost_threshold`, `contact_cost`, `max_episode_steps`, `num_threads`.
+        **options: `max_episode_steps`, `num_threads`, and the task's own (`TaskInfo.options`).
 
     Returns:
         The environment: `reset(key)`, `step(state, action)`, single simulation, to be vmapped.
@@ -33,9 +39,9 @@ def make(name: str, physics: str = "auto", **options: Any) -> "Environment":
         raise ValueError(f"unknown task {name!r}: choose one of {', '.join(TASKS)}")
     if physics not in PHYSICS:
         raise ValueError(f"unknown physics {physics!r}: choose one of {', '.join(PHYSICS)}")
-    from envs.locomotion import Locomotion
-
-    return Locomotion(name, physics=physics, **options)
+    module, builder = _FAMILIES[TASKS[name].family]
+    environment: Environment = getattr(importlib.import_module(module), builder)(name, physics=physics, **options)
+    return environment
 
 
 def __getattr__(name: str) -> Any:

@@ -53,7 +53,7 @@ class Locomotion:
     ):
         self.name = name
         self.task = task = TABLE[name]
-        self.cost_threshold = TASKS[name].cost_threshold if cost_threshold is None else cost_threshold
+        self.cost_threshold = TASKS[name].options["cost_threshold"] if cost_threshold is None else cost_threshold
         self.max_episode_steps = max_episode_steps
         self.model = model = load_model(task.xml)
         self.dt = float(model.opt.timestep) * task.frame_skip

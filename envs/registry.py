@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Any
 
 PHYSICS = ("auto", "native", "mjx", "warp")
 
@@ -12,39 +13,59 @@ class TaskInfo:
     """What is known of a task without building it."""
 
     name: str
-    family: str  # "locomotion": which module builds it
+    family: str  # "locomotion" or "safety_gym": which class `envs.make` builds
     obs_dim: int
     action_dim: int
-    cost_threshold: float  # the 0/1 cost is 1 where the task's quantity exceeds it
+    options: Mapping[str, Any]  # of `envs.make`, this family's own, with the task's defaults
     cost_limit: float  # default episode cost allowed to the expert that records demonstrations
-    gymnasium_id: str  # the original that the task is compared with
-    cost: str  # the quantity behind the cost, in words
+    original: str  # the environment that the task is compared with, in gymnasium or safety-gymnasium
+    cost: str  # what costs 1 in a step, in words
 
 
-def _locomotion(
-    name: str, dims: tuple[int, int], cost_threshold: float, cost_limit: float, cost: str
-) -> tuple[str, TaskInfo]:
-    return name, TaskInfo(
+def _locomotion(name: str, dims: tuple[int, int], cost_threshold: float, cost_limit: float, quantity: str) -> TaskInfo:
+    return TaskInfo(
         name=name,
         family="locomotion",
         obs_dim=dims[0],
         action_dim=dims[1],
-        cost_threshold=cost_threshold,
+        options=MappingProxyType({"cost_threshold": cost_threshold, "contact_cost": True}),
         cost_limit=cost_limit,
-        gymnasium_id=f"{name}-v5",
+        original=f"{name}-v5",
+        cost=f"{quantity} > {cost_threshold:g}",
+    )
+
+
+_HAZARD = "the robot's centre is over a hazard"
+_BUTTON = f"{_HAZARD}, it touches a wrong button or a gremlin"
+
+
+def _safety_gym(name: str, dims: tuple[int, int], cost: str) -> TaskInfo:
+    return TaskInfo(
+        name=name,
+        family="safety_gym",
+        obs_dim=dims[0],
+        action_dim=dims[1],
+        options=MappingProxyType({}),
+        cost_limit=25.0,  # of the published results on these tasks (Ray et al. 2019)
+        original=f"Safety{name}-v0",
         cost=cost,
     )
 
 
-TASKS: Mapping[str, TaskInfo] = MappingProxyType(
-    dict(
-        (
-            _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s"),
-            _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
-            _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
-            _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
-            _locomotion("Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost"),
-            _locomotion("Humanoid", (270, 17), 0.2, 40.0, "0.1 * sum of squared actions + contact cost"),
-        )
-    )
+_ROWS = (
+    _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s"),
+    _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
+    _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
+    _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
+    _locomotion("Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost"),
+    _locomotion("Humanoid", (270, 17), 0.2, 40.0, "0.1 * sum of squared actions + contact cost"),
+    _safety_gym("PointGoal1", (60, 2), _HAZARD),
+    _safety_gym("PointButton1", (76, 2), _BUTTON),
+    _safety_gym("PointPush1", (76, 2), _HAZARD),
+    _safety_gym("CarGoal1", (72, 2), _HAZARD),
+    _safety_gym("CarButton1", (88, 2), _BUTTON),
+    _safety_gym("CarPush1", (88, 2), _HAZARD),
+    _safety_gym("DoggoGoal1", (104, 12), _HAZARD),
+    _safety_gym("DoggoButton1", (120, 12), _BUTTON),
 )
+TASKS: Mapping[str, TaskInfo] = MappingProxyType({task.name: task for task in _ROWS})

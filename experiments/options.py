@@ -18,7 +18,7 @@ DEFAULTS: Mapping[str, Any] = {
     "seed": 0,
     "physics": "auto",
     "cost_threshold": None,
-    "contact_cost": True,
+    "contact_cost": None,
     "max_episode_steps": 1000,
     "preset": "default",
     "eval_episodes": 50,
@@ -39,7 +39,12 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
     add("preset", "hyperparameters to start from", choices=tuple(PRESETS))
     add("physics", "engine; auto is native on a CPU and mjx on an accelerator", choices=PHYSICS)
     add("cost_threshold", "per-step threshold of the 0/1 cost (default: the task's)", type=float, metavar="X")
-    add("contact_cost", "whether the contact term counts in the cost (Ant, Humanoid)", type=boolean, metavar="BOOL")
+    add(
+        "contact_cost",
+        "whether contacts count in the cost (Ant, Humanoid; default: true)",
+        type=boolean,
+        metavar="BOOL",
+    )
     add("max_episode_steps", "time limit of an episode", type=positive, metavar="T")
     add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
 
@@ -94,11 +99,10 @@ def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
     threshold = choices["cost_threshold"]
     if threshold is not None and not 0 <= threshold < float("inf"):
         raise UsageError(f"--cost-threshold {threshold}: must be finite and not negative")
-    return {
-        "cost_threshold": task.cost_threshold if threshold is None else threshold,
-        "contact_cost": choices["contact_cost"],
-        "max_episode_steps": choices["max_episode_steps"],
-    }
+    given = {name: choices[name] for name in ("cost_threshold", "contact_cost") if choices[name] is not None}
+    for name in given.keys() - task.options.keys():
+        raise UsageError(f"--{name.replace('_', '-')}: {task.name} has no such option; leave it out")
+    return {**task.options, **given, "max_episode_steps": choices["max_episode_steps"]}
 
 
 def _with_hyphens(message: str) -> str:

@@ -101,7 +101,7 @@ def make_simulator(env: Any) -> Any:
     import gymnasium
 
     return gymnasium.make(
-        TASKS[env.name].gymnasium_id,
+        TASKS[env.name].original,
         max_episode_steps=env.max_episode_steps,
         **({"include_cfrc_ext_in_observation": False} if env.name in ("Ant", "Humanoid") else {}),
     )

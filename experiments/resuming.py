@@ -22,6 +22,7 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
     saved = {
         **dataclasses.asdict(run.config),
         **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
+        **dict.fromkeys(("cost_threshold", "contact_cost")),  # of tasks that have them:
         **run.facts["env_options"],
         "env": run.facts["task"],
         "num_demos": demos["num_episodes"] if demos else None,

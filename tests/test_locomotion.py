@@ -22,7 +22,7 @@ NOISE = {  # half-width of qpos, scale of qvel, whether qvel is normal
 }
 
 
-@pytest.fixture(scope="module", params=envs.TASKS)
+@pytest.fixture(scope="module", params=[name for name, info in envs.TASKS.items() if info.family == "locomotion"])
 def env(request: pytest.FixtureRequest) -> Any:
     return envs.make(request.param, physics="native")
 
