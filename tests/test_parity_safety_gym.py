@@ -112,7 +112,7 @@ def worlds(recording: Recording) -> World:
             backend=jnp.zeros(count),
         ),
         layout=jnp.asarray(recording.layout),
-        mocap_quat=jnp.asarray(recording.mocap_quat),
+        mocap_quat=jnp.asarray(recording.mocap_quat) if env.model.nmocap else None,
         goal_button=jnp.asarray(data["goal_button"]),
         timer=jnp.asarray(data["timer"]),
         distances={ours: jnp.asarray(data[theirs]) for ours, theirs in LAST_DISTANCES[env.task.aim].items()},

@@ -78,14 +78,13 @@ def test_distances_are_distributed_as_in_the_original(task_name: str) -> None:
 
 def test_an_attempt_takes_the_first_clear_candidate() -> None:
     """Against the original's own way, object after object, in plain Python."""
-    radii = [0.4, 0.3, 0.3, 0.2]
+    radii = np.array([0.4, 0.3, 0.3, 0.2])
     key = jax.random.key(3)
     placed, complete = layout.attempt(key, radii)
-    first_key, *keys = jax.random.split(key, len(radii))
-    expected = [np.asarray(layout.candidates(first_key, radii[0], 1))[0]]
-    for i, one in enumerate(keys, start=1):
-        for point in np.asarray(layout.candidates(one, radii[i], layout.NUM_CANDIDATES)):
-            if all(np.linalg.norm(point - p) >= radii[i] + r for p, r in zip(expected, radii, strict=False)):
+    expected: list[np.ndarray] = []
+    for radius, points in zip(radii, np.asarray(layout.candidates(key, radii, layout.NUM_CANDIDATES)), strict=True):
+        for point in points:
+            if all(np.linalg.norm(point - p) >= radius + r for p, r in zip(expected, radii, strict=False)):
                 expected.append(point)
                 break
     assert complete

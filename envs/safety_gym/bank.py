@@ -14,7 +14,7 @@ BATCH = 4096
 
 def make_bank(size: int, seed: int) -> np.ndarray:
     """[size, 14, 2] float32: the first `size` attempts that place everything, in the order of their keys."""
-    radii = keepouts(TABLE["PointButton1"]).tolist()
+    radii = keepouts(TABLE["PointButton1"])
     run = jax.jit(jax.vmap(lambda key: attempt(key, radii)))
     key, found, count = jax.random.key(seed), [], 0
     while count < size:

@@ -28,7 +28,7 @@ class World:
 
     data: physics_lib.Data
     layout: jax.Array  # [P, 2] places at reset, of the robot and of every object; a goal's is kept up to date
-    mocap_quat: jax.Array  # [num_mocap, 4]
+    mocap_quat: jax.Array | None  # [num_mocap, 4]; None without mocap bodies (no array of size 0 can be saved)
     goal_button: jax.Array  # [] int32
     timer: jax.Array  # [] int32 control steps
     distances: dict[str, jax.Array]  # [] each: what the next step's reward is counted from
@@ -126,7 +126,7 @@ class SafetyGym:
         world = World(
             data=self._physics.init(qpos, qvel, mocap),
             layout=layout,
-            mocap_quat=mocap_quat,
+            mocap_quat=mocap_quat if self.model.nmocap else None,
             goal_button=jnp.asarray(goal_button, jnp.int32),
             timer=jnp.asarray(timer, jnp.int32),
             distances={},
@@ -181,7 +181,7 @@ class SafetyGym:
     def _advance(self, world: World, ctrl: jax.Array) -> World:
         """The world after the engine's substeps: nothing else has changed yet."""
         mocap = None
-        if self.model.nmocap:
+        if world.mocap_quat is not None:
             path = self._mocap_path(world.layout, world.ticks)
             mocap = Mocap(pos=path if self._circling else path[0], quat=world.mocap_quat)
         data = self._physics.step(world.data, ctrl, mocap)

@@ -12,6 +12,7 @@ from importlib import resources
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from envs.safety_gym.tasks import ARENA, ROBOT_KEEPOUT, SafetyGymTask
@@ -34,17 +35,17 @@ def places_of(task: SafetyGymTask) -> dict[str, slice]:
     return slices
 
 
-def candidates(key: jax.Array, keepout: float, count: int) -> Float[Array, "C 2"]:
-    """Centres such that the whole keepout lies within the arena. `key` is consumed."""
-    reach = ARENA - keepout
-    return jax.random.uniform(key, (count, 2), minval=-reach, maxval=reach)
+def candidates(key: jax.Array, keepouts: ArrayLike, count: int) -> Float[Array, "... C 2"]:
+    """`count` centres for each keepout, such that all of it lies within the arena. `key` is consumed."""
+    reach = ARENA - jnp.asarray(keepouts)
+    return reach[..., None, None] * jax.random.uniform(key, (*reach.shape, count, 2), minval=-1.0)
 
 
 def is_clear(
     points: Float[Array, "C 2"],
-    keepout: float,
+    keepout: ArrayLike,
     others: Float[Array, "P 2"],
-    other_keepouts: Sequence[float] | np.ndarray,
+    other_keepouts: ArrayLike,
 ) -> Bool[Array, " C"]:
     """Which points are at least the sum of both keepouts away from all others."""
     distance = jnp.linalg.norm(points[:, None] - others[None], axis=-1)
@@ -56,17 +57,20 @@ def first_clear(points: Float[Array, "C 2"], clear: Bool[Array, " C"]) -> tuple[
     return points[jnp.argmax(clear)], clear.any()
 
 
-def attempt(key: jax.Array, radii: Sequence[float]) -> tuple[Float[Array, "P 2"], Bool[Array, ""]]:
+def attempt(key: jax.Array, radii: Sequence[float] | np.ndarray) -> tuple[Float[Array, "P 2"], Bool[Array, ""]]:
     """One attempt at a layout: a place for each object in turn, and whether all found one. `key` is consumed."""
-    first_key, *keys = jax.random.split(key, len(radii))
-    placed = candidates(first_key, radii[0], 1)
-    complete = jnp.ones((), bool)
-    for i, key in enumerate(keys, start=1):
-        points = candidates(key, radii[i], NUM_CANDIDATES)
-        place, found = first_clear(points, is_clear(points, radii[i], placed, radii[:i]))
-        placed = jnp.concatenate([placed, place[None]])
-        complete &= found
-    return placed, complete
+    radii = jnp.asarray(radii)
+    order = jnp.arange(len(radii))
+
+    def place(placed: jax.Array, turn: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        index, points = turn
+        clear = is_clear(points, radii[index], placed, jnp.where(order < index, radii, -jnp.inf))
+        spot, found = first_clear(points, clear)
+        return placed.at[index].set(spot), found
+
+    points = candidates(key, radii, NUM_CANDIDATES)
+    layout, found = jax.lax.scan(place, jnp.zeros((len(radii), 2), points.dtype), (order, points))
+    return layout, found.all()
 
 
 def sample(task: SafetyGymTask, key: jax.Array) -> Float[Array, "P 2"]:
@@ -75,7 +79,7 @@ def sample(task: SafetyGymTask, key: jax.Array) -> Float[Array, "P 2"]:
     radii = keepouts(task)
     if task.aim == "button":
         return from_bank(layout_key)
-    layout, _ = attempt(layout_key, radii.tolist())
+    layout, _ = attempt(layout_key, radii)
     # The goal is drawn once more, against everything else, as it will be when it is met.
     row = places_of(task)["goal"].start
     others = np.delete(np.arange(len(radii)), row)
