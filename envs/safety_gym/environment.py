@@ -9,7 +9,7 @@ from flax import struct
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
-from envs.base import State
+from envs.base import State, compute_where
 from envs.physics import Mocap
 from envs.safety_gym import layout as layouts
 from envs.safety_gym import scene as scenes
@@ -60,7 +60,7 @@ class SafetyGym:
         self.name = name
         self.task = task = TABLE[name]
         self.max_episode_steps = max_episode_steps
-        self.scene = scene = scenes.build(task)
+        self.scene = scene = scenes.build(task, prisms=physics_lib.resolve(physics) != "native")
         self.model = model = scene.model
         self.dt = float(model.opt.timestep) * scenes.SUBSTEPS
         self.action_dim = model.nu
@@ -198,7 +198,7 @@ class SafetyGym:
             timer = jnp.where(met, BUTTON_PAUSE, timer)
             goal = world.layout[self._places["buttons"]][goal_button]
         else:
-            goal = jnp.where(met, self._draw_goal(world, goal_key), world.layout[self._places["goal"]][0])
+            goal = compute_where(met, self._draw_goal, world.layout[self._places["goal"]][0], world, goal_key)
         world = dataclasses.replace(
             world, layout=self._with_goal(world.layout, goal), goal_button=goal_button, timer=timer, key=key
         )

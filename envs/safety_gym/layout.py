@@ -6,7 +6,6 @@ has the same distribution, and all candidates are drawn at once.
 """
 
 import functools
-from collections.abc import Sequence
 from importlib import resources
 
 import jax
@@ -57,19 +56,19 @@ def first_clear(points: Float[Array, "C 2"], clear: Bool[Array, " C"]) -> tuple[
     return points[jnp.argmax(clear)], clear.any()
 
 
-def attempt(key: jax.Array, radii: Sequence[float] | np.ndarray) -> tuple[Float[Array, "P 2"], Bool[Array, ""]]:
+def attempt(key: jax.Array, radii: ArrayLike) -> tuple[Float[Array, "P 2"], Bool[Array, ""]]:
     """One attempt at a layout: a place for each object in turn, and whether all found one. `key` is consumed."""
-    radii = jnp.asarray(radii)
-    order = jnp.arange(len(radii))
+    keepout = jnp.asarray(radii)
+    order = jnp.arange(len(keepout))
 
     def place(placed: jax.Array, turn: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         index, points = turn
-        clear = is_clear(points, radii[index], placed, jnp.where(order < index, radii, -jnp.inf))
+        clear = is_clear(points, keepout[index], placed, jnp.where(order < index, keepout, -jnp.inf))
         spot, found = first_clear(points, clear)
         return placed.at[index].set(spot), found
 
-    points = candidates(key, radii, NUM_CANDIDATES)
-    layout, found = jax.lax.scan(place, jnp.zeros((len(radii), 2), points.dtype), (order, points))
+    points = candidates(key, keepout, NUM_CANDIDATES)
+    layout, found = jax.lax.scan(place, jnp.zeros((len(keepout), 2), points.dtype), (order, points))
     return layout, found.all()
 
 

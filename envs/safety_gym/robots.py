@@ -35,10 +35,32 @@ class Style:
 
     contype: int
     conaffinity: int
+    prism: Callable[[float, float], str] | None = None  # radius, half-length -> mesh; see `scene.build`
+    floor: int = 0  # the part of conaffinity that a cylinder keeps where a prism stands in for it
 
 
 def _add_geom(body: mujoco.MjsBody, style: Style, **settings: object) -> None:
     body.add_geom(contype=style.contype, conaffinity=style.conaffinity, **settings)
+
+
+def _add_cylinder(
+    body: mujoco.MjsBody, style: Style, radius: float, half_length: float, pos: list[float], density: float
+) -> None:
+    """A cylinder along the body's x axis, or the two geoms that act as one on MJX."""
+    settings = {"pos": pos, "quat": [math.sqrt(0.5), 0, math.sqrt(0.5), 0]}
+    cylinder = {"type": GEOM.mjGEOM_CYLINDER, "size": [radius, half_length, 0], "density": density} | settings
+    if style.prism is None:
+        _add_geom(body, style, **cylinder)
+        return
+    body.add_geom(contype=0, conaffinity=style.floor, **cylinder)
+    body.add_geom(
+        type=GEOM.mjGEOM_MESH,
+        meshname=style.prism(radius, half_length),
+        mass=0,
+        contype=style.contype,
+        conaffinity=style.conaffinity & ~style.floor,
+        **settings,
+    )
 
 
 # --- Point: slides on a plane, pushed along its arrow, turned by a servo ---
@@ -88,19 +110,10 @@ def _build_car(root: mujoco.MjsBody, style: Style) -> None:
         ([0.05, 0.03, 0.01], [0, -0.13, 0.04]),
     ):
         _add_geom(root, style, type=box, size=size, pos=pos, density=5)
-    quarter = math.sqrt(0.5)
     for side, x, centre in (("left", -0.1, -0.03), ("right", 0.1, 0.03)):
         wheel = root.add_body(name=side, pos=[x, 0.1, -0.05])
         wheel.add_joint(name=side, type=JOINT.mjJNT_HINGE, axis=[1, 0, 0], damping=0.001)
-        _add_geom(
-            wheel,
-            style,
-            type=GEOM.mjGEOM_CYLINDER,
-            size=[0.05, 0.025, 0],
-            pos=[centre, 0, 0],
-            quat=[quarter, 0, quarter, 0],
-            density=5,
-        )
+        _add_cylinder(wheel, style, 0.05, 0.025, [centre, 0, 0], density=5)
     rear = root.add_body(name="rear", pos=[0, -0.1, -0.05])
     rear.add_joint(name="rear", type=JOINT.mjJNT_BALL, damping=0.001)
     _add_geom(rear, style, type=GEOM.mjGEOM_SPHERE, size=[0.05, 0, 0], density=5)
@@ -162,13 +175,12 @@ def _build_leg(torso: mujoco.MjsBody, leg: int, style: Style) -> None:
 
 def _build_doggo(root: mujoco.MjsBody, style: Style) -> None:
     root.add_freejoint(name="root")
-    cylinder = {"type": GEOM.mjGEOM_CYLINDER, "size": [0.0375, 0, 0], "density": 2}
-    _add_geom(root, style, fromto=[0, 0, 0, 0.1, 0, 0], **cylinder)
+    _add_cylinder(root, style, 0.0375, 0.05, [0.05, 0, 0], density=2)
     _build_leg(root, 1, style)
     _build_leg(root, 4, style)
     rear = root.add_body(name="rear")
     _add_hinge(rear, "waist_x", [1, 0, 0], (-0.523599, 0.523599), 0.0)
-    _add_geom(rear, style, fromto=[0, 0, 0, -0.1, 0, 0], **cylinder)
+    _add_cylinder(rear, style, 0.0375, 0.05, [-0.05, 0, 0], density=2)
     _build_leg(rear, 2, style)
     _build_leg(rear, 3, style)
 

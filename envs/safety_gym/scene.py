@@ -11,6 +11,7 @@ at distance 0 without vertical freedom, and there the contact never acts.
 """
 
 import dataclasses
+import functools
 
 import mujoco
 import numpy as np
@@ -20,6 +21,7 @@ from envs.safety_gym.tasks import ObjectKind, SafetyGymTask
 
 GEOM, SENSOR, OBJECT = mujoco.mjtGeom, mujoco.mjtSensor, mujoco.mjtObj
 SUBSTEPS = 10  # engine steps per control step
+PRISM_SIDES = 16
 
 # Collision classes: bits of contype. Two geoms can touch if either names the other's class in its conaffinity.
 FLOOR, ROBOT, MOVABLE, FIXED, GREMLIN = (1 << i for i in range(5))
@@ -46,18 +48,25 @@ class Scene:
     contacts: dict[str, slice]  # kind -> entries of sensordata: number of contacts with the robot
 
 
-def build(task: SafetyGymTask) -> Scene:
-    """Compiles the model of a task."""
+def build(task: SafetyGymTask, *, prisms: bool = False) -> Scene:
+    """Compiles the model of a task.
+
+    Args:
+        task: what it holds.
+        prisms: whether other shapes stand in for cylinders, for MJX, which cannot do cylinder against box, and whose
+            sphere against cylinder misses shallow contacts. A robot's cylinders keep touching the floor; all else
+            meets a prism of 16 sides in their place. The pillar is a capsule: the same up to 1 m, above any robot.
+    """
     robot = ROBOTS[task.robot]
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.option.timestep = robot.timestep
     _set_geom_defaults(spec)
     spec.worldbody.add_geom(name="floor", type=GEOM.mjGEOM_PLANE, size=[3.5, 3.5, 0.1], contype=FLOOR, conaffinity=0)
-    _add_robot(spec, robot)
+    _add_robot(spec, robot, prisms)
     for kind in task.objects:
         for i in range(kind.count if kind.shape != "none" else 0):
-            _add_object(spec, kind, i)
+            _add_object(spec, kind, i, prisms)
     num_observed = _add_sensors(spec, robot)
     touched = [kind for kind in task.objects if kind.name in task.costs and kind.shape != "none"]
     for kind in touched:
@@ -110,7 +119,7 @@ def _set_geom_defaults(spec: mujoco.MjSpec) -> None:
     geom.friction = [1, 0.005, 0.0001]
 
 
-def _add_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+def _add_robot(spec: mujoco.MjSpec, robot: Robot, prisms: bool) -> None:
     root = spec.worldbody.add_body(name="robot", pos=[0, 0, robot.height])
     root.add_site(name="robot")
     touches = MOVABLE | FIXED | GREMLIN
@@ -118,14 +127,27 @@ def _add_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
         touches |= FLOOR
     if robot.name == "Doggo":  # its legs can meet
         touches |= ROBOT
-    robot.build(root, Style(contype=ROBOT, conaffinity=touches))
+    prism = functools.partial(_add_prism, spec) if prisms else None
+    robot.build(root, Style(contype=ROBOT, conaffinity=touches, prism=prism, floor=touches & FLOOR))
     robot.actuate(spec)
     for actuator in spec.actuators:
         actuator.ctrlrange = [-1, 1]
         actuator.ctrllimited = True
 
 
-def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int) -> None:
+def _add_prism(spec: mujoco.MjSpec, radius: float, half_length: float) -> str:
+    """The mesh of an upright prism with a cylinder's cross-section area; its name."""
+    name = f"prism_{radius}_{half_length}"
+    if name not in {mesh.name for mesh in spec.meshes}:
+        angles = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
+        reach = radius * np.sqrt(2 * np.pi / (PRISM_SIDES * np.sin(2 * np.pi / PRISM_SIDES)))
+        ring = reach * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        vertices = [[*point, z] for z in (-half_length, half_length) for point in ring]
+        spec.add_mesh(name=name, uservert=np.ravel(vertices).tolist())
+    return name
+
+
+def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int, prisms: bool) -> None:
     name = f"{kind.name}_{index}"
     body = spec.worldbody.add_body(name=name, pos=[0, 0, kind.height], mocap=not kind.free)
     if kind.free:
@@ -153,7 +175,8 @@ def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int) -> None:
     elif kind.shape == "sphere":
         body.add_geom(name=name, type=GEOM.mjGEOM_SPHERE, size=[kind.size, 0, 0], **settings)
     elif kind.shape == "cylinder":
-        body.add_geom(name=name, type=GEOM.mjGEOM_CYLINDER, size=[kind.size, kind.height, 0], **settings)
+        shape = GEOM.mjGEOM_CAPSULE if prisms else GEOM.mjGEOM_CYLINDER
+        body.add_geom(name=name, type=shape, size=[kind.size, kind.height, 0], **settings)
     elif kind.shape == "push_box":
         s = kind.size
         body.add_geom(name=name, type=GEOM.mjGEOM_BOX, size=[s, s, s], **settings)
