@@ -56,7 +56,8 @@ class Locomotion:
         self.cost_threshold = TASKS[name].options["cost_threshold"] if cost_threshold is None else cost_threshold
         self.max_episode_steps = max_episode_steps
         self.model = model = load_model(task.xml)
-        self.dt = float(model.opt.timestep) * task.frame_skip
+        self.num_substeps = task.frame_skip
+        self.dt = float(model.opt.timestep) * self.num_substeps
         self.obs_dim, self.action_dim = TASKS[name].obs_dim, TASKS[name].action_dim
         self.action_low, self.action_high = model.actuator_ctrlrange.astype("float32").T
         self._contact = task.contact if contact_cost else None
@@ -64,7 +65,7 @@ class Locomotion:
         self._physics = physics_lib.make_physics(
             physics,
             model,
-            num_substeps=task.frame_skip,
+            num_substeps=self.num_substeps,
             fields=fields,
             track=[task.track],
             num_threads=num_threads,

@@ -41,7 +41,7 @@ class Setting:
 def measure(setting: Setting) -> dict[str, Any]:
     """Measures everything in turn, `rounds` times, and returns medians.
 
-    Rates are control steps of all seeds per second; a control step is `frame_skip` engine steps.
+    Rates are control steps of all seeds per second; a control step is `num_substeps` engine steps.
     `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does under random
     controls: the ceiling of the native backend.
     """
@@ -70,7 +70,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         "method": setting.method,
         "num_seeds": setting.num_seeds,
         "num_envs": setting.num_envs,
-        "frame_skip": env.task.frame_skip,
+        "num_substeps": env.num_substeps,
         "physics_steps_per_second": median["physics"],
         "rollout_steps_per_second": median["rollout"],
         "training_steps_per_second": median["training"],
@@ -114,7 +114,7 @@ def _physics(env: Any, setting: Setting) -> Work:
     def work() -> int:
         for control in controls:
             engine.state[:, columns] = control
-            engine.step(nstep=env.task.frame_skip)
+            engine.step(nstep=env.num_substeps)
         return num_steps * num_sims
 
     return work

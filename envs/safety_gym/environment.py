@@ -62,7 +62,8 @@ class SafetyGym:
         self.max_episode_steps = max_episode_steps
         self.scene = scene = scenes.build(task, prisms=physics_lib.resolve(physics) != "native")
         self.model = model = scene.model
-        self.dt = float(model.opt.timestep) * scenes.SUBSTEPS
+        self.num_substeps = scenes.SUBSTEPS
+        self.dt = float(model.opt.timestep) * self.num_substeps
         self.action_dim = model.nu
         self.action_low, self.action_high = model.actuator_ctrlrange.astype("float32").T
         self._kinds = {kind.name: kind for kind in task.objects}
@@ -71,7 +72,7 @@ class SafetyGym:
         self._physics = physics_lib.make_physics(
             physics,
             model,
-            num_substeps=scenes.SUBSTEPS,
+            num_substeps=self.num_substeps,
             fields=["sensordata"],
             refresh=True,
             num_threads=num_threads,
