@@ -11,6 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from envs.registry import TASKS
+from experiments import figures, top_down
 from experiments.original import NumpyPolicy
 from experiments.run_folder import Run
 
@@ -83,7 +85,7 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
 
 
 def play_run(run: Run, seed: int, caption: str) -> str:
-    """The HTML of an episode of one seed of a run folder."""
+    """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above."""
     import jax
 
     import envs
@@ -92,6 +94,12 @@ def play_run(run: Run, seed: int, caption: str) -> str:
     env: Any = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
     policy = NumpyPolicy(run.config, jax.tree.map(lambda leaf: np.asarray(leaf[seed]), loaded.agent))
+    if TASKS[env.name].family == "safety_gym":
+        image = figures.png(top_down.draw(env, top_down.record(env, policy)))
+        caption = f"{html.escape(caption)} From dark to light as time goes by; red: a cost is paid."
+        return (
+            f"<figure>{figures.html_image(image, 'an episode from above')}<figcaption>{caption}</figcaption></figure>"
+        )
     return to_html(record_poses(env, policy), f"episode-{env.name}-{run.folder.resolve().name}", caption)
 
 

@@ -1,6 +1,8 @@
 """Learning curves as PNG files: mean and standard deviation over seeds, with the expert's level drawn."""
 
+import base64
 import dataclasses
+import html
 import io
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +22,7 @@ PANELS = (
 )
 _MAX_POINTS = 100  # of a curve: few episodes end in an iteration, and their scatter would hide the learning
 COLORS = ("#0b6e99", "#d1495b", "#6a994e", "#e09f3e", "#7b5ea7", "#3d405b", "#00a5a5", "#a44a3f")
-_STYLE: Any = {
+STYLE: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 10,
     "axes.titlesize": 11,
@@ -83,7 +85,7 @@ def draw_panels(curves: Sequence[Curve], task: str, names: Sequence[str] | None 
     panels = [panel for panel in PANELS if names is None or panel[0] in names]
     steps = {_steps_per_iteration(c) for c in curves}
     label = f"iterations of {min(steps):,} steps" if len(steps) == 1 else "environment steps per seed"
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.1 * len(panels) + 0.3, 3.9), dpi=150, layout="constrained")
         for axes, (name, title) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
             for i, curve in enumerate(curves):
@@ -100,6 +102,12 @@ def png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
     return buffer.getvalue()
+
+
+def html_image(image: bytes, text: str) -> str:
+    """An `img` element that holds the PNG file itself; `text` stands for it where it is not shown."""
+    source = f"data:image/png;base64,{base64.b64encode(image).decode()}"
+    return f"<img alt='{html.escape(text, quote=True)}' src='{source}'>"
 
 
 def _steps_per_iteration(curve: Curve) -> int:

@@ -1,7 +1,6 @@
 """One self-contained HTML page about finished runs: curves, metrics with intervals, every seed, what was different."""
 
 import argparse
-import base64
 import dataclasses
 import html
 import sys
@@ -135,10 +134,11 @@ def page(
 def _task_section(
     task: str, entries: Sequence[Entry], image: bytes, seed: int, player: Callable[[Entry], str] | None
 ) -> Iterable[str]:
-    source = f"data:image/png;base64,{base64.b64encode(image).decode()}"
+    from experiments import figures  # imports matplotlib
+
     yield f"<h2>{_text(task)}</h2>"
     yield (
-        f"<figure><img alt='Return, cost and cost rate on {_text(task)}' src='{source}'>"
+        f"<figure>{figures.html_image(image, f'Return, cost and cost rate on {task}')}"
         "<figcaption>Thick: mean over seeds. Band: standard deviation. Thin: every seed. "
         "Dashed: mean of the demonstrations.</figcaption></figure>"
     )

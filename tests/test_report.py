@@ -218,3 +218,28 @@ def test_benchmark_measures_a_row(tmp_path: Path) -> None:
     assert row["training_to_physics"] == pytest.approx(ratio)
     assert row["compile_seconds"] > 0
     assert row["peak_memory_mib"] > 100
+
+
+def test_a_safety_gym_episode_is_drawn_from_above() -> None:
+    import envs
+    from experiments import top_down
+
+    class Ahead:
+        """Full thrust."""
+
+        def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
+            return np.array([1.0, 0.2])
+
+    env: Any = envs.make("PointGoal1", physics="native")
+    episode = top_down.record(env, Ahead(), num_steps=30)  # type: ignore[arg-type]
+    assert episode.robot.shape == (31, 2)
+    assert {name: places.shape for name, places in episode.objects.items()} == {
+        "goal": (31, 1, 2),
+        "hazards": (31, 8, 2),
+        "vases": (31, 1, 2),
+    }
+    assert np.hypot(*np.diff(episode.robot, axis=0).T).max() > 1e-3
+    axes = top_down.draw(env, episode).axes[0]
+    circles = [patch for patch in axes.patches if patch.get_gid() is None and hasattr(patch, "radius")]
+    assert len(circles) == 8 + 1 + episode.met.sum()
+    assert "PointGoal1: 30 steps" in axes.get_title(loc="left")
