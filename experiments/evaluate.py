@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from envs.registry import TASKS
 from experiments import command_line, run_folder, summary
 from experiments.command_line import Parser, UsageError
 from experiments.run_folder import Run
@@ -30,6 +31,9 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--seed", default=1, type=command_line.natural, metavar="N", help="of the episodes (default: 1)"
     )
+    parser.add_argument(
+        "--export", type=Path, metavar="FILE", help="also write the policies and these episodes as NumPy arrays (.npz)"
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="result file (default: RUN_DIR/evaluation.json)")
     return parser
 
@@ -44,6 +48,13 @@ def run(arguments: argparse.Namespace) -> None:
         raise UsageError(f"RUN_DIR {arguments.run}: holds no checkpoint; train first, or resume with `train --resume`")
     path = arguments.out or arguments.run / "evaluation.json"
     command_line.check_writable(path.parent, "--out")
+    if arguments.export:
+        command_line.check_writable(arguments.export.parent, "--export")
+    if arguments.simulator == "original" and TASKS[stored.facts["task"]].family == "safety_gym":
+        raise UsageError(
+            "--simulator original: safety-gymnasium needs an environment of its own; use --export FILE and run there "
+            "`python tests/golden/run_policy.py FILE`"
+        )
     earlier = run_folder.read_json(path) if path.is_file() else {}
     content, reference = evaluate_run(stored, arguments)
     run_folder.write_json(path, {**earlier, arguments.simulator: content})
@@ -73,6 +84,10 @@ def evaluate_run(stored: Run, arguments: argparse.Namespace) -> tuple[dict[str, 
     else:
         contact_cost = stored.facts["env_options"]["contact_cost"]
         evaluated = original.evaluate(loaded.config, loaded.agent, env, contact_cost=contact_cost, **settings)
+    if arguments.export:
+        facts = {"task": env.name, "original": TASKS[env.name].original, "simulator": arguments.simulator, **settings}
+        original.export(arguments.export, loaded.config, loaded.agent, evaluated, facts)
+        print(f"policies {arguments.export}")
     random = evaluation.random_policy(env, num_episodes=arguments.episodes, seed=arguments.seed)
     reference = summary.Reference(
         expert_return=stored.facts["expert_return"],

@@ -4,14 +4,18 @@ Reward and cost follow the task's rule (`envs.locomotion`), fed with the reward 
 """
 
 import dataclasses
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ccil_jax import npz
 from ccil_jax.config import Config
 from envs.registry import TASKS
 
+_LAYER = ("kernel", "bias")
 _CLIP = 5.0  # of normalised observations, as in ccil_jax.running_statistics
 _MIN_STD = 1e-2
 _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -52,6 +56,11 @@ class NumpyPolicy:
         self._mean = np.asarray(statistics.mean, np.float64)
         self._std = np.maximum(np.sqrt(variance), _MIN_STD) if count > 0 else np.ones_like(variance)
         self._action_std = np.exp(np.asarray(actor.policy_params["log_std"], np.float64))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `tests/golden/run_policy.py` computes it from where JAX cannot be installed."""
+        layers = {f"{name}_{i}": x for i, pair in enumerate(self._layers) for name, x in zip(_LAYER, pair, strict=True)}
+        return layers | {"obs_mean": self._mean, "obs_std": self._std, "action_std": self._action_std}
 
     def mode(self, obs: np.ndarray) -> np.ndarray:
         """[obs_dim] -> [action_dim], the mean of the policy's distribution."""
@@ -94,6 +103,32 @@ def evaluate(
     simulator.close()
     totals = np.array(results).reshape(num_seeds, num_episodes, 3)
     return Totals(totals[..., 0], totals[..., 1], totals[..., 2])
+
+
+def export(path: Path, config: Config, actor: Any, evaluation: Any, facts: dict[str, Any]) -> None:
+    """Writes every seed's policy as NumPy arrays [num_seeds]-leading, with what it achieved here.
+
+    Args:
+        path: an `.npz` file.
+        config: for the activation.
+        actor: [num_seeds]-leading.
+        evaluation: `episode_return` and `episode_cost`, [num_seeds, num_episodes] each.
+        facts: more metadata, to be written as JSON.
+    """
+    import jax
+
+    num_seeds = len(actor.obs_statistics.count)
+    policies = [
+        NumpyPolicy(config, jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), actor)) for i in range(num_seeds)
+    ]
+    arrays = jax.tree.map(lambda *seeds: np.stack(seeds), *[policy.arrays() for policy in policies])
+    metadata = facts | {"activation": config.activation, "obs_clip": _CLIP}
+    npz.write(
+        path,
+        arrays
+        | {name: np.asarray(getattr(evaluation, name)) for name in ("episode_return", "episode_cost")}
+        | {"metadata": np.array(json.dumps(metadata))},
+    )
 
 
 def make_simulator(env: Any) -> Any:
