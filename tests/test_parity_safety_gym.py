@@ -151,7 +151,7 @@ def test_observations_reward_cost_and_goals_from_recorded_states(recording: Reco
 
 # Of the robot's velocity after a control step without contacts between objects: median, 90 %, 99 %. The original ran
 # MuJoCo 2.3.3 from its own warm start: where solver tolerance counts, 3.17 and it part (specification, section 12).
-BOUNDS = {"Point": (1e-12, 1e-10, 1e-2), "Car": (1e-11, 1e-3, 4.0), "Doggo": (1e-10, 1e-8, 1e-3)}
+BOUNDS = {"Point": (1e-13, 1e-11, 1e-9), "Car": (1e-13, 1e-3, 10.0), "Doggo": (1e-13, 1e-10, 1e-4)}
 
 
 def test_one_control_step_without_contacts_between_objects(recording: Recording) -> None:
