@@ -264,6 +264,7 @@ class SafetyGym:
         return jnp.concatenate([places, jnp.full_like(places[:, :1], self._kinds[name].height)], axis=1)
 
     def situation(self, world: World) -> Situation:
+        """Where everything is, for rewards, costs and pictures."""
         contacts = world.data.fields["sensordata"]
         centres = {name: self._centres(world, name) for name in self._kinds}
         return Situation(
