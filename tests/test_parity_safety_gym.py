@@ -123,6 +123,24 @@ def worlds(recording: Recording) -> World:
     )
 
 
+def feels_contacts(env: SafetyGym) -> np.ndarray:
+    """[obs_dim] bool: what the accelerometer and the touch sensors give."""
+    chosen = np.zeros(env.obs_dim, bool)
+    kinds = [int(mujoco.mjtSensor.mjSENS_ACCELEROMETER), int(mujoco.mjtSensor.mjSENS_TOUCH)]
+    for kind, start, width in zip(env.model.sensor_type, env.model.sensor_adr, env.model.sensor_dim, strict=True):
+        if start < env.scene.num_observed and kind in kinds:
+            chosen[start : start + width] = True
+    return chosen
+
+
+def without_contacts(data: dict[str, np.ndarray]) -> np.ndarray:
+    """[R] bool: no object touched the robot or another object."""
+    free = ~data["any_object_contact"]
+    if "gremlin_floor_contact" in data:  # pruned here: gremlins rise from the floor in the first steps
+        free &= ~data["gremlin_floor_contact"]
+    return free
+
+
 def test_observations_reward_cost_and_goals_from_recorded_states(recording: Recording) -> None:
     with jax.enable_x64(True):
         env, data = recording.env, recording.data
@@ -146,9 +164,14 @@ def test_observations_reward_cost_and_goals_from_recorded_states(recording: Reco
         np.testing.assert_array_equal(value, recorded > 0, err_msg=name)
     np.testing.assert_array_equal(np.any(list(charged.values()), axis=0), data["cost"])
     assert obs.shape == data["obs"].shape
-    np.testing.assert_allclose(obs[:, env.scene.num_observed :], data["obs"][:, env.scene.num_observed :], atol=1e-9)
-    free = ~data["any_object_contact"]
-    np.testing.assert_allclose(obs[free][:, 3:12], data["obs"][free][:, 3:12], rtol=1e-5, atol=1e-9)
+    of_contacts = feels_contacts(env)
+    np.testing.assert_allclose(obs[:, ~of_contacts], data["obs"][:, ~of_contacts], atol=1e-9)
+    # Between objects, MuJoCo 2.3.3 and 3.17 find other contact points; with the floor the solvers' tolerance counts.
+    free = without_contacts(data)
+    felt, theirs = obs[free][:, of_contacts], data["obs"][free][:, of_contacts]
+    error = (np.abs(felt - theirs) / (1 + np.abs(theirs))).max(axis=1)
+    assert np.quantile(error, 0.95) < 1e-9
+    assert error.max() < 1e-4
 
 
 # Of the robot's velocity after a control step without contacts between objects: median, 90 %, 99 %. The original ran
@@ -168,10 +191,7 @@ def warmly_started(env: SafetyGym, state: State, warm_start: np.ndarray) -> Stat
 def steps_without_contacts(recording: Recording, env: SafetyGym, count: int | None = None) -> np.ndarray:
     """[R] error of the robot's velocity after a control step of `env` from recorded states."""
     data, scene = recording.data, env.scene
-    free = ~data["any_object_contact"]
-    if "gremlin_floor_contact" in data:  # pruned here: gremlins rise from the floor in the first steps
-        free &= ~data["gremlin_floor_contact"]
-    chosen = np.flatnonzero(free)[:count]
+    chosen = np.flatnonzero(without_contacts(data))[:count]
     assert len(chosen) > 100
     ticks = np.round(data["time"] / env.model.opt.timestep).astype(np.int32)
 
