@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envs.base import State
+from envs.base import State, first_state, next_state
 
 BraxState = Any
 
@@ -151,19 +151,7 @@ class FromBrax:
     def reset(self, key: jax.Array) -> State:
         """Starts an episode; `key` is consumed."""
         start = self._env.reset(key)
-        zero = jnp.zeros((), start.obs.dtype)
-        return State(
-            physics=start,
-            obs=start.obs,
-            reward=zero,
-            cost=zero,
-            terminated=jnp.zeros((), bool),
-            truncated=jnp.zeros((), bool),
-            step_count=jnp.zeros((), jnp.int32),
-            episode_return=zero,
-            episode_cost=zero,
-            terms={"reward": zero},
-        )
+        return first_state(start, start.obs, ("reward",))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step."""
@@ -171,16 +159,13 @@ class FromBrax:
         new = self._env.step(state.physics, action)
         reward = jnp.asarray(new.reward, state.reward.dtype)
         cost = jnp.asarray(self._cost(state.physics, action, new), state.cost.dtype)
-        step_count = state.step_count + 1
-        return State(
+        return next_state(
+            state,
             physics=new,
             obs=new.obs,
             reward=reward,
             cost=cost,
             terminated=new.done > 0.5,
-            truncated=step_count >= self.max_episode_steps,
-            step_count=step_count,
-            episode_return=state.episode_return + reward,
-            episode_cost=state.episode_cost + cost,
             terms={"reward": reward},
+            max_episode_steps=self.max_episode_steps,
         )

@@ -4,7 +4,7 @@ An environment is a set of pure functions of one simulation; callers `vmap` them
 Auto-reset is not here: `ccil_jax.rollout` owns it, so `step` always returns the true successor.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Protocol, TypeVar
 
 import jax
@@ -34,6 +34,61 @@ class State:
     def done(self) -> jax.Array:
         """[] bool: the episode is over, for either reason."""
         return self.terminated | self.truncated
+
+
+def first_state(physics: PyTree, obs: jax.Array, terms: Iterable[str]) -> State:
+    """The state after a reset; `terms` are the names of `State.terms`."""
+    zero, no = jnp.zeros((), obs.dtype), jnp.zeros((), bool)
+    return State(
+        physics=physics,
+        obs=obs,
+        reward=zero,
+        cost=zero,
+        terminated=no,
+        truncated=no,
+        step_count=jnp.zeros((), jnp.int32),
+        episode_return=zero,
+        episode_cost=zero,
+        terms=dict.fromkeys(terms, zero),
+    )
+
+
+def next_state(
+    state: State,
+    *,
+    physics: PyTree,
+    obs: jax.Array,
+    reward: jax.Array,
+    cost: jax.Array,
+    terminated: jax.Array,
+    terms: dict[str, jax.Array],
+    max_episode_steps: int,
+    finite: jax.typing.ArrayLike = True,
+) -> State:
+    """The state a control step after `state`, with its totals.
+
+    Where `finite` [] bool is false the episode terminates, nothing is earned or paid, and what is not finite is shown
+    as 0: one NaN would spoil a learner's whole batch.
+    """
+    finite = jnp.asarray(finite)
+
+    def shown(x: jax.Array) -> jax.Array:
+        return jnp.where(finite | jnp.isfinite(x), x, 0.0)
+
+    reward, cost = jnp.where(finite, reward, 0.0), jnp.where(finite, cost, 0.0)
+    step_count = state.step_count + 1
+    return State(
+        physics=physics,
+        obs=shown(obs),
+        reward=reward,
+        cost=cost,
+        terminated=terminated | ~finite,
+        truncated=step_count >= max_episode_steps,
+        step_count=step_count,
+        episode_return=state.episode_return + reward,
+        episode_cost=state.episode_cost + cost,
+        terms={name: shown(term) for name, term in terms.items()},
+    )
 
 
 class Environment(Protocol):
@@ -79,19 +134,20 @@ def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tr
     def turn(carry: tuple[jax.Array, Tree]) -> tuple[jax.Array, Tree]:
         # The barrier ties the arguments to this turn: XLA moves out of a loop what depends on nothing in it. Keys pass
         # it as plain numbers: JAX's check of key reuse does not know that the loop turns once.
-        needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(_numbers, args)))
+        needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(numbers, args)))
         return jnp.zeros_like(needed), compute(*jax.tree.map(_like, args, bound))
 
     return jax.lax.while_loop(lambda carry: carry[0], turn, (needed, otherwise))[1]
 
 
-def _is_key(leaf: jax.Array) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _numbers(leaf: jax.Array) -> jax.Array:
+def numbers(leaf: jax.Array) -> jax.Array:
+    """The leaf itself, or the numbers behind a random key."""
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
-def _like(leaf: jax.Array, numbers: jax.Array) -> jax.Array:
-    return jax.random.wrap_key_data(numbers, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else numbers
+def _like(leaf: jax.Array, plain: jax.Array) -> jax.Array:
+    return jax.random.wrap_key_data(plain, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else plain
+
+
+def _is_key(leaf: jax.Array) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)

@@ -17,7 +17,7 @@ import mujoco
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
-from envs.base import State
+from envs.base import State, first_state, next_state
 from envs.locomotion_tasks import TABLE, CostInputs
 from envs.registry import TASKS
 
@@ -86,19 +86,7 @@ class Locomotion:
     def reset_to(self, qpos: ArrayLike, qvel: ArrayLike) -> State:
         """Starts an episode at `qpos` `[nq]`, `qvel` `[nv]`."""
         data = self._physics.init(qpos, qvel)
-        zero = jnp.zeros((), data.qpos.dtype)
-        return State(
-            physics=data,
-            obs=self._observe(data),
-            reward=zero,
-            cost=zero,
-            terminated=jnp.zeros((), bool),
-            truncated=jnp.zeros((), bool),
-            step_count=jnp.zeros((), jnp.int32),
-            episode_return=zero,
-            episode_cost=zero,
-            terms={"forward": zero, "healthy": zero, "control": zero, "contact": zero},
-        )
+        return first_state(data, self._observe(data), ("forward", "healthy", "control", "contact"))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. See `Environment.step`."""
@@ -112,19 +100,16 @@ class Locomotion:
         )
         cost = (quantity > self.cost_threshold).astype(state.cost.dtype)
         finite = jnp.isfinite(obs).all() & jnp.isfinite(reward) & jnp.isfinite(quantity)
-        reward, cost = jnp.where(finite, reward, 0.0), jnp.where(finite, cost, 0.0)
-        step_count = state.step_count + 1
-        return State(
+        return next_state(
+            state,
             physics=data,
-            obs=jnp.where(jnp.isfinite(obs), obs, 0.0),
+            obs=obs,
             reward=reward,
             cost=cost,
-            terminated=~(finite & self._healthy(data)),
-            truncated=step_count >= self.max_episode_steps,
-            step_count=step_count,
-            episode_return=state.episode_return + reward,
-            episode_cost=state.episode_cost + cost,
-            terms={name: jnp.where(jnp.isfinite(term), term, 0.0) for name, term in terms.items()},
+            terminated=~self._healthy(data),
+            terms=terms,
+            max_episode_steps=self.max_episode_steps,
+            finite=finite,
         )
 
     def _healthy(self, data: physics_lib.Data) -> jax.Array:

@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.registry import TASKS
 from experiments import figures, top_down
-from experiments.original import NumpyPolicy
+from experiments.original import NumpyPolicy, policies
 from experiments.run_folder import Run
 
 _STEPS_PER_FRAME = 2
@@ -86,14 +86,12 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
 
 def play_run(run: Run, seed: int, caption: str) -> str:
     """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above."""
-    import jax
-
     import envs
     from ccil_jax import runner
 
     env: Any = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
-    policy = NumpyPolicy(run.config, jax.tree.map(lambda leaf: np.asarray(leaf[seed]), loaded.agent))
+    policy = policies(run.config, loaded.agent)[seed]
     if TASKS[env.name].family == "safety_gym":
         image = figures.png(top_down.draw(env, top_down.record(env, policy)))
         caption = f"{html.escape(caption)} From dark to light as time goes by; red: a cost is paid."

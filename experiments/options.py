@@ -13,12 +13,12 @@ from envs.registry import PHYSICS, TASKS, TaskInfo
 from experiments.command_line import Parser, UsageError, boolean, integer, natural, positive
 
 CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
+TASK_OPTIONS = ("cost_threshold", "contact_cost")  # some tasks have them; None leaves them to the task
 DEFAULTS: Mapping[str, Any] = {
     "num_seeds": 3,
     "seed": 0,
     "physics": "auto",
-    "cost_threshold": None,
-    "contact_cost": None,
+    **dict.fromkeys(TASK_OPTIONS),
     "max_episode_steps": 1000,
     "preset": "default",
     "eval_episodes": 50,
@@ -99,7 +99,7 @@ def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
     threshold = choices["cost_threshold"]
     if threshold is not None and not 0 <= threshold < float("inf"):
         raise UsageError(f"--cost-threshold {threshold}: must be finite and not negative")
-    given = {name: choices[name] for name in ("cost_threshold", "contact_cost") if choices[name] is not None}
+    given = {name: choices[name] for name in TASK_OPTIONS if choices[name] is not None}
     for name in given.keys() - task.options.keys():
         raise UsageError(f"--{name.replace('_', '-')}: {task.name} has no such option; leave it out")
     return {**task.options, **given, "max_episode_steps": choices["max_episode_steps"]}

@@ -75,6 +75,14 @@ class NumpyPolicy:
         return self.mode(obs) + self._action_std * random.standard_normal(self._action_std.shape)
 
 
+def policies(config: Config, actor: Any) -> list[NumpyPolicy]:
+    """Every seed's policy; `actor` is [num_seeds]-leading."""
+    import jax
+
+    seeds = range(len(actor.obs_statistics.count))
+    return [NumpyPolicy(config, jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), actor)) for i in seeds]
+
+
 def evaluate(
     config: Config,
     actor: Any,
@@ -89,19 +97,14 @@ def evaluate(
 
     `contact_cost` is the option of that name which `env` was made with.
     """
-    import jax
-
-    simulator = make_simulator(env)
-    num_seeds = len(actor.obs_statistics.count)
-    results = []
-    for index in range(num_seeds):
-        policy = NumpyPolicy(config, jax.tree.map(lambda leaf, i=index: np.asarray(leaf[i]), actor))
+    simulator, learnt, results = make_simulator(env), policies(config, actor), []
+    for index, policy in enumerate(learnt):
         random = np.random.default_rng([seed, index])
         for episode in range(num_episodes):
             steps = run_episode(simulator, policy, random, (seed + episode) % 2**32, deterministic)
             results.append(score(env, steps, contact_cost))
     simulator.close()
-    totals = np.array(results).reshape(num_seeds, num_episodes, 3)
+    totals = np.array(results).reshape(len(learnt), num_episodes, 3)
     return Totals(totals[..., 0], totals[..., 1], totals[..., 2])
 
 
@@ -117,11 +120,7 @@ def export(path: Path, config: Config, actor: Any, evaluation: Any, facts: dict[
     """
     import jax
 
-    num_seeds = len(actor.obs_statistics.count)
-    policies = [
-        NumpyPolicy(config, jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), actor)) for i in range(num_seeds)
-    ]
-    arrays = jax.tree.map(lambda *seeds: np.stack(seeds), *[policy.arrays() for policy in policies])
+    arrays = jax.tree.map(lambda *seeds: np.stack(seeds), *[policy.arrays() for policy in policies(config, actor)])
     metadata = facts | {"activation": config.activation, "obs_clip": _CLIP}
     npz.write(
         path,

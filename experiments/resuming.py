@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from experiments import run_folder
+from experiments import options, run_folder
 from experiments.command_line import UsageError
 
 
@@ -22,7 +22,7 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
     saved = {
         **dataclasses.asdict(run.config),
         **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
-        **dict.fromkeys(("cost_threshold", "contact_cost")),  # of tasks that have them:
+        **dict.fromkeys(options.TASK_OPTIONS),  # where the task has none; else:
         **run.facts["env_options"],
         "env": run.facts["task"],
         "num_demos": demos["num_episodes"] if demos else None,

@@ -109,14 +109,11 @@ def _draw_kind(axes: Axes, kind: ObjectKind, episode: Episode) -> None:
     for path in np.moveaxis(places, 1, 0):
         if kind.free:
             axes.plot(*path.T, color=color, lw=0.8, alpha=0.7)
-        round_ = kind.shape in ("none", "sphere", "cylinder")
-        corner = path[0] - kind.size
-        patch = (
-            Circle(tuple(path[0]), kind.size, fc=color, alpha=0.45, ec=color, label=label)
-            if round_
-            else Rectangle(tuple(corner), 2 * kind.size, 2 * kind.size, fc=color, alpha=0.45, ec=color, label=label)
-        )
-        axes.add_patch(patch)
+        style: Any = {"fc": color, "alpha": 0.45, "ec": color, "label": label}
+        if kind.shape in ("none", "sphere", "cylinder"):
+            axes.add_patch(Circle(tuple(path[0]), kind.size, **style))
+        else:
+            axes.add_patch(Rectangle(tuple(path[0] - kind.size), 2 * kind.size, 2 * kind.size, **style))
         label = None
 
 

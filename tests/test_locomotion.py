@@ -9,7 +9,6 @@ import pytest
 
 import envs
 from envs.base import State
-from envs.testing import check_environment
 
 NUM_ENVS = 8
 NOISE = {  # half-width of qpos, scale of qvel, whether qvel is normal
@@ -25,18 +24,6 @@ NOISE = {  # half-width of qpos, scale of qvel, whether qvel is normal
 @pytest.fixture(scope="module", params=[name for name, info in envs.TASKS.items() if info.family == "locomotion"])
 def env(request: pytest.FixtureRequest) -> Any:
     return envs.make(request.param, physics="native")
-
-
-def test_environment_contract(env: Any) -> None:
-    check_environment(env)
-
-
-def test_sizes_are_the_registrys(env: Any) -> None:
-    info = envs.TASKS[env.name]
-    assert (env.obs_dim, env.action_dim) == (info.obs_dim, info.action_dim) == (env.obs_dim, env.model.nu)
-    assert env.action_low.shape == env.action_high.shape == (env.action_dim,)
-    assert env.physics_name == "native"
-    assert env.max_episode_steps == 1000
 
 
 def test_reset_noise(env: Any) -> None:

@@ -16,26 +16,8 @@ from envs.safety_gym import layout
 from envs.safety_gym.environment import BUTTON_PAUSE, CIRCLE, SafetyGym
 from envs.safety_gym.lidar import lidar
 from envs.safety_gym.tasks import ARENA, TABLE
-from envs.testing import check_environment
 
-TASKS = [name for name, info in envs.TASKS.items() if info.family == "safety_gym"]
 RECORDED_LAYOUTS = Path(__file__).parent / "golden" / "safety_gym" / "layouts.npz"
-
-
-@pytest.fixture(scope="module", params=TASKS)
-def env(request: pytest.FixtureRequest) -> Any:
-    return envs.make(request.param, physics="native")
-
-
-def test_environment_contract(env: Any) -> None:
-    check_environment(env)
-
-
-def test_sizes_are_the_registrys(env: Any) -> None:
-    info = envs.TASKS[env.name]
-    assert (env.obs_dim, env.action_dim) == (info.obs_dim, info.action_dim)
-    assert env.action_low.shape == env.action_high.shape == (env.action_dim,)
-    assert env.max_episode_steps == 1000
 
 
 # Layouts -------------------------------------------------------------------------------------------------------------

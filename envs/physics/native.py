@@ -91,7 +91,7 @@ class NativePhysics:
         )
 
     def init(self, qpos: ArrayLike, qvel: ArrayLike, mocap: Mocap | None = None) -> Data:
-        """See `Physics.init`. Without derived arrays the engine is not called: auto-reset runs this at each step."""
+        """See `Physics.init`. Without derived arrays the engine is not called."""
         dtype = jnp.result_type(float)
         qpos, qvel = jnp.asarray(qpos, dtype), jnp.asarray(qvel, dtype)
         rest = jnp.zeros(self._row_size - 1 - self._model.nq - self._model.nv, dtype)

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.scipy.spatial.transform import Rotation
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
-from envs.base import State, compute_where
+from envs.base import State, compute_where, first_state, next_state
 from envs.physics import Mocap
 from envs.safety_gym import layout as layouts
 from envs.safety_gym import scene as scenes
@@ -135,20 +136,8 @@ class SafetyGym:
             key=key,
         )
         world = dataclasses.replace(world, distances=AIMS[self.task.aim].distances(self.situation(world)))
-        zero = jnp.zeros((), layout.dtype)
         terms = [*world.distances, "bonus", *(f"cost_{name}" for name in self.task.costs)]
-        return State(
-            physics=world,
-            obs=self.observe(world),
-            reward=zero,
-            cost=zero,
-            terminated=jnp.zeros((), bool),
-            truncated=jnp.zeros((), bool),
-            step_count=jnp.zeros((), jnp.int32),
-            episode_return=zero,
-            episode_cost=zero,
-            terms=dict.fromkeys(terms, zero),
-        )
+        return first_state(world, self.observe(world), terms)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. See `Environment.step`."""
@@ -164,19 +153,16 @@ class SafetyGym:
         world = self._aim_anew(world, met)
         obs = self.observe(world)
         finite = jnp.isfinite(obs).all() & jnp.isfinite(reward)
-        reward, cost = jnp.where(finite, reward, 0.0), jnp.where(finite, cost, 0.0)
-        step_count = state.step_count + 1
-        return State(
+        return next_state(
+            state,
             physics=world,
-            obs=jnp.where(jnp.isfinite(obs), obs, 0.0),
+            obs=obs,
             reward=reward,
             cost=cost,
-            terminated=~finite,
-            truncated=step_count >= self.max_episode_steps,
-            step_count=step_count,
-            episode_return=state.episode_return + reward,
-            episode_cost=state.episode_cost + cost,
+            terminated=jnp.zeros((), bool),
             terms=terms | {f"cost_{name}": value.astype(reward.dtype) for name, value in charged.items()},
+            max_episode_steps=self.max_episode_steps,
+            finite=finite,
         )
 
     def _advance(self, world: World, ctrl: jax.Array) -> World:
@@ -228,7 +214,7 @@ class SafetyGym:
         path = jnp.zeros((scenes.SUBSTEPS, self.model.nmocap, 3), layout.dtype)
         for name, rows in self.scene.mocap.items():
             kind, centres = self._kinds[name], layout[self._places[name]]
-            places = centres + course[:, None] if kind.circling else centres + 0 * course[:, None]
+            places = centres + course[:, None] if kind.circling else centres
             path = path.at[:, rows, :2].set(places).at[:, rows, 2].set(FLIGHT if kind.circling else kind.height)
         return path
 
@@ -300,11 +286,4 @@ def _turned(yaw: jax.Array) -> jax.Array:
 
 def _rotation(quat: jax.Array) -> jax.Array:
     """[3, 3] of a quaternion (w, x, y, z) of any length."""
-    w, x, y, z = quat / jnp.sqrt(jnp.sum(jnp.square(quat)))
-    return jnp.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(jnp.roll(quat, -1)).as_matrix()

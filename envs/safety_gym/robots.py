@@ -21,6 +21,7 @@ class Robot:
     name: str
     timestep: float  # s, of the engine
     height: float  # of the root body's origin at reset
+    meets_itself: bool = False  # whether its parts can touch each other
     planar: bool  # qpos begins with x, y, yaw; otherwise with a free joint's position and quaternion
     build: Callable[[mujoco.MjsBody, "Style"], None]  # adds joints, geoms and bodies to the root body
     actuate: Callable[[mujoco.MjSpec], None]
@@ -212,6 +213,7 @@ ROBOTS = {
         timestep=0.01,
         height=0.22,
         planar=False,
+        meets_itself=True,
         build=_build_doggo,
         actuate=_actuate_doggo,
         sensors=(

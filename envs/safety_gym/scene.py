@@ -67,7 +67,7 @@ def build(task: SafetyGymTask, *, prisms: bool = False) -> Scene:
     for kind in task.objects:
         for i in range(kind.count if kind.shape != "none" else 0):
             _add_object(spec, kind, i, prisms)
-    num_observed = _add_sensors(spec, robot)
+    num_sensors = _add_sensors(spec, robot)
     touched = [kind for kind in task.objects if kind.name in task.costs and kind.shape != "none"]
     for kind in touched:
         for i in range(kind.count):
@@ -94,7 +94,7 @@ def build(task: SafetyGymTask, *, prisms: bool = False) -> Scene:
         },
         ball_qpos=_qpos_address(model, robot.ball) if robot.ball else None,
         hinge_qpos=np.array([_qpos_address(model, name) for name in robot.hinges], int),
-        num_observed=num_observed,
+        num_observed=int(model.sensor_dim[:num_sensors].sum()),
         contacts={
             kind.name: slice(first := int(model.sensor(f"contact_{kind.name}_0").adr[0]), first + kind.count)
             for kind in touched
@@ -125,7 +125,7 @@ def _add_robot(spec: mujoco.MjSpec, robot: Robot, prisms: bool) -> None:
     touches = MOVABLE | FIXED | GREMLIN
     if not robot.planar:
         touches |= FLOOR
-    if robot.name == "Doggo":  # its legs can meet
+    if robot.meets_itself:
         touches |= ROBOT
     prism = functools.partial(_add_prism, spec) if prisms else None
     robot.build(root, Style(contype=ROBOT, conaffinity=touches, prism=prism, floor=touches & FLOOR))
@@ -186,10 +186,9 @@ def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int, prisms: bool)
 
 
 def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> int:
-    """Every robot's and this robot's own sensors, in the order of the observation; how many numbers they give."""
+    """Every robot's and this robot's own sensors, in the order of the observation; how many they are."""
     for name, kind in _BASIC_SENSORS:
         spec.add_sensor(name=name, type=kind, objtype=OBJECT.mjOBJ_SITE, objname="robot")
     for name, kind, objtype, target in robot.sensors:
         spec.add_sensor(name=name, type=kind, objtype=objtype, objname=target)
-    width = {SENSOR.mjSENS_TOUCH: 1, SENSOR.mjSENS_JOINTVEL: 1, SENSOR.mjSENS_BALLANGVEL: 3}
-    return 3 * len(_BASIC_SENSORS) + sum(width[kind] for _, kind, _, _ in robot.sensors)
+    return len(_BASIC_SENSORS) + len(robot.sensors)
