@@ -196,7 +196,7 @@ def steps_without_contacts(recording: Recording, env: SafetyGym, count: int | No
     ticks = np.round(data["time"] / env.model.opt.timestep).astype(np.int32)
 
     def reset(qpos: Any, qvel: Any, layout: Any, quat: Any, ticks: Any) -> State:
-        return env.reset_to(qpos, qvel, layout=layout, mocap_quat=quat, ticks=ticks, key=jax.random.key(0))
+        return env.reset_to(layout, qpos, qvel, mocap_quat=quat, ticks=ticks)
 
     starts = (recording.qpos, recording.qvel, recording.layout, recording.mocap_quat, ticks)
     state = jax.jit(jax.vmap(reset))(*[jnp.asarray(x[chosen]) for x in starts])

@@ -97,9 +97,8 @@ def start(env: SafetyGym, places: dict[str, Any], **changes: Any) -> State:
     where[0] = 0.0
     for name, at in places.items():
         where[rows[name]] = at
-    qpos, quat = env._initial_poses(jnp.asarray(where), jnp.zeros(len(where)))
-    settings = {"layout": where, "mocap_quat": quat, "key": jax.random.key(0)} | changes
-    return env.reset_to(qpos, jnp.zeros(env.model.nv), **settings)
+    qpos, _ = env._initial_poses(jnp.asarray(where), jnp.zeros(len(where)))
+    return env.reset_to(where, qpos, jnp.zeros(env.model.nv), **changes)
 
 
 @pytest.fixture(scope="module")

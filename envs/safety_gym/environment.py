@@ -90,38 +90,41 @@ class SafetyGym:
         goal_button = jnp.zeros((), jnp.int32)
         if self.task.aim == "button":
             goal_button = jax.random.randint(goal_key, (), 0, self._kinds["buttons"].count)
-            layout = self._with_goal(layout, layout[self._places["buttons"]][goal_button])
         qpos, mocap_quat = self._initial_poses(layout, yaws)
-        return self.reset_to(
-            qpos, jnp.zeros(self.model.nv), layout=layout, mocap_quat=mocap_quat, goal_button=goal_button, key=key
-        )
+        qvel = jnp.zeros(self.model.nv)
+        return self.reset_to(layout, qpos, qvel, mocap_quat=mocap_quat, goal_button=goal_button, key=key)
 
     def reset_to(
         self,
+        layout: ArrayLike,
         qpos: ArrayLike,
         qvel: ArrayLike,
         *,
-        layout: ArrayLike,
-        mocap_quat: ArrayLike,
+        mocap_quat: ArrayLike | None = None,
         goal_button: ArrayLike = 0,
         timer: ArrayLike = 0,
         ticks: ArrayLike = 0,
-        key: jax.Array,
+        key: jax.Array | None = None,
     ) -> State:
         """Starts an episode in a given situation.
 
         Args:
+            layout: `[P, 2]` m, places of robot and objects, in the order of `layout.places_of`. The rows of what the
+                engine moves (robot, vases, push box) are where it started and no longer matter; the goal of a button
+                task is put on the button to press.
             qpos: `[nq]`.
             qvel: `[nv]`.
-            layout: `[P, 2]` places of robot and objects, in the order of `layout.places_of`. The rows of what the
-                engine moves (robot, vases, push box) are where it started and no longer matter.
-            mocap_quat: `[num_mocap, 4]`: the gremlins' own orientations, the identity for all else.
+            mocap_quat: `[num_mocap, 4]`: the gremlins' own orientations, the identity for all else and by default.
             goal_button: `[]` int, the button to press.
             timer: `[]` int, control steps of the pause that a right press has begun.
             ticks: `[]` int, engine steps since the episode began.
-            key: of the goals to come; consumed.
+            key: of the goals to come; consumed. By default that of seed 0.
         """
         layout = jnp.asarray(layout, jnp.result_type(float))
+        if self.task.aim == "button":
+            layout = self._with_goal(layout, layout[self._places["buttons"]][goal_button])
+        if mocap_quat is None:
+            mocap_quat = jnp.zeros((self.model.nmocap, 4)).at[:, 0].set(1.0)
         mocap_quat = jnp.asarray(mocap_quat, layout.dtype)
         ticks = jnp.asarray(ticks, jnp.int32)
         mocap = Mocap(pos=self._mocap_path(layout, ticks)[0], quat=mocap_quat) if self.model.nmocap else None
@@ -133,7 +136,7 @@ class SafetyGym:
             timer=jnp.asarray(timer, jnp.int32),
             distances={},
             ticks=ticks,
-            key=key,
+            key=jax.random.key(0) if key is None else key,
         )
         world = dataclasses.replace(world, distances=AIMS[self.task.aim].distances(self.situation(world)))
         terms = [*world.distances, "bonus", *(f"cost_{name}" for name in self.task.costs)]
