@@ -112,6 +112,10 @@ class Locomotion:
             finite=finite,
         )
 
+    def engine_arrays(self, state: State) -> dict[str, jax.Array]:
+        """The `MjData` arrays, by name, from which C MuJoCo draws a state or steps on."""
+        return {"qpos": state.physics.qpos, "qvel": state.physics.qvel}
+
     def _healthy(self, data: physics_lib.Data) -> jax.Array:
         healthy = self.task.healthy
         return jnp.ones((), bool) if healthy is None else healthy(data.qpos, data.qvel)

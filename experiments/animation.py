@@ -70,7 +70,7 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
     frames, costs, cost = [], [], False
     for i in range(num_steps):
         if i % _STEPS_PER_FRAME == 0:
-            data.qpos[:] = np.asarray(state.physics.qpos)
+            data.qpos[:] = np.asarray(env.engine_arrays(state)["qpos"])
             mujoco.mj_kinematics(model, data)
             frames.append(_segments(model, data, geoms)[:, :, axes].reshape(len(geoms), 4))
             costs.append(cost)

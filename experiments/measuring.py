@@ -100,7 +100,7 @@ def _peak_memory() -> float:
 
 
 def _physics(env: Any, setting: Setting) -> Work:
-    """The engine alone: no JAX, no observations, rewards or resets."""
+    """The engine alone, from states after a reset: no JAX, no observations, rewards or further resets."""
     from envs.physics.native import usable_cpus
 
     num_sims, num_steps = setting.num_seeds * setting.num_envs, 100
@@ -108,6 +108,9 @@ def _physics(env: Any, setting: Setting) -> Work:
     before = mujoco.mjtState.mjSTATE_PHYSICS | mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_WARMSTART
     start = mujoco.mj_stateSize(env.model, int(before))
     columns = slice(start, start + env.model.nu)
+    keys = jax.random.split(jax.random.key(setting.seed), num_sims)
+    for name, values in jax.vmap(lambda key: env.engine_arrays(env.reset(key)))(keys).items():
+        engine.bind(name)[:] = values
     random = np.random.default_rng(setting.seed)
     controls = random.uniform(env.action_low, env.action_high, (num_steps, num_sims, env.model.nu))
 

@@ -168,6 +168,15 @@ class SafetyGym:
             finite=finite,
         )
 
+    def engine_arrays(self, state: State) -> dict[str, jax.Array]:
+        """The `MjData` arrays, by name, from which C MuJoCo draws a state or steps on."""
+        world = state.physics
+        arrays = {"qpos": world.data.qpos, "qvel": world.data.qvel}
+        if world.mocap_quat is None:
+            return arrays
+        pos = self._mocap_path(world.layout, world.ticks)[0]
+        return arrays | {"mocap_pos": pos, "mocap_quat": world.mocap_quat}
+
     def _advance(self, world: World, ctrl: jax.Array) -> World:
         """The world after the engine's substeps: nothing else has changed yet."""
         mocap = None
