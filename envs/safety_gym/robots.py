@@ -6,7 +6,7 @@ radians. The root body's origin is "the robot's position" everywhere.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import mujoco
 
@@ -32,36 +32,25 @@ class Robot:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Style:
-    """What all geoms of a robot share."""
+    """How the geoms of a robot take part in contacts."""
 
-    contype: int
-    conaffinity: int
-    prism: Callable[[float, float], str] | None = None  # radius, half-length -> mesh; see `scene.build`
-    floor: int = 0  # the part of conaffinity that a cylinder keeps where a prism stands in for it
+    classes: Mapping[mujoco.mjtGeom, tuple[int, int]]  # contype and conaffinity of each shape; see `scene`
+    make_prism: Callable[[float, float], str] | None  # radius, half-length -> mesh, where prisms help cylinders out
 
 
-def _add_geom(body: mujoco.MjsBody, style: Style, **settings: object) -> None:
-    body.add_geom(contype=style.contype, conaffinity=style.conaffinity, **settings)
+def _add_geom(body: mujoco.MjsBody, style: Style, type: mujoco.mjtGeom, **settings: object) -> None:
+    contype, conaffinity = style.classes[type]
+    body.add_geom(type=type, contype=contype, conaffinity=conaffinity, **settings)
 
 
 def _add_cylinder(
     body: mujoco.MjsBody, style: Style, radius: float, half_length: float, pos: list[float], density: float
 ) -> None:
-    """A cylinder along the body's x axis, or the two geoms that act as one on MJX."""
-    settings = {"pos": pos, "quat": [math.sqrt(0.5), 0, math.sqrt(0.5), 0]}
-    cylinder = {"type": GEOM.mjGEOM_CYLINDER, "size": [radius, half_length, 0], "density": density} | settings
-    if style.prism is None:
-        _add_geom(body, style, **cylinder)
-        return
-    body.add_geom(contype=0, conaffinity=style.floor, **cylinder)
-    body.add_geom(
-        type=GEOM.mjGEOM_MESH,
-        meshname=style.prism(radius, half_length),
-        mass=0,
-        contype=style.contype,
-        conaffinity=style.conaffinity & ~style.floor,
-        **settings,
-    )
+    """A cylinder along the body's x axis, if need be with the prism that meets in its place what it cannot."""
+    where = {"pos": pos, "quat": [math.sqrt(0.5), 0, math.sqrt(0.5), 0]}
+    _add_geom(body, style, GEOM.mjGEOM_CYLINDER, size=[radius, half_length, 0], density=density, **where)
+    if style.make_prism is not None:
+        _add_geom(body, style, GEOM.mjGEOM_MESH, meshname=style.make_prism(radius, half_length), mass=0, **where)
 
 
 # --- Point: slides on a plane, pushed along its arrow, turned by a servo ---

@@ -23,8 +23,9 @@ GEOM, SENSOR, OBJECT = mujoco.mjtGeom, mujoco.mjtSensor, mujoco.mjtObj
 SUBSTEPS = 10  # engine steps per control step
 PRISM_SIDES = 16
 
-# Collision classes: bits of contype. Two geoms can touch if either names the other's class in its conaffinity.
-FLOOR, ROBOT, MOVABLE, FIXED, GREMLIN = (1 << i for i in range(5))
+# Collision classes: bits of contype. Two geoms can touch if either names the other's class in its conaffinity. A BALL
+# stands still. So does a pillar, for round things ROUND and for flat ones FLAT: on MJX these are two geoms.
+FLOOR, ROBOT, MOVABLE, GREMLIN, BALL, ROUND, FLAT = (1 << i for i in range(7))
 
 _BASIC_SENSORS = (
     ("accelerometer", SENSOR.mjSENS_ACCELEROMETER),
@@ -53,9 +54,10 @@ def build(task: SafetyGymTask, *, prisms: bool = False) -> Scene:
 
     Args:
         task: what it holds.
-        prisms: whether other shapes stand in for cylinders, for MJX, which cannot do cylinder against box, and whose
-            sphere against cylinder misses shallow contacts. A robot's cylinders keep touching the floor; all else
-            meets a prism of 16 sides in their place. The pillar is a capsule: the same up to 1 m, above any robot.
+        prisms: whether other shapes help cylinders out, for MJX, which has no cylinder against box: a prism of 16
+            sides meets boxes and other prisms. A robot's cylinders keep meeting the floor and balls. The pillar's
+            meets spheres and capsules as a capsule, the same up to 1 m, above any robot: MJX misses every second
+            contact of a capsule and a box face along it. `tests/test_mjx_shapes.py` has these pairs.
     """
     robot = ROBOTS[task.robot]
     spec = mujoco.MjSpec()
@@ -122,13 +124,21 @@ def _set_geom_defaults(spec: mujoco.MjSpec) -> None:
 def _add_robot(spec: mujoco.MjSpec, robot: Robot, prisms: bool) -> None:
     root = spec.worldbody.add_body(name="robot", pos=[0, 0, robot.height])
     root.add_site(name="robot")
-    touches = MOVABLE | FIXED | GREMLIN
+    touches = MOVABLE | GREMLIN | BALL | ROUND | FLAT
     if not robot.planar:
         touches |= FLOOR
     if robot.meets_itself:
         touches |= ROBOT
-    prism = functools.partial(_add_prism, spec) if prisms else None
-    robot.build(root, Style(contype=ROBOT, conaffinity=touches, prism=prism, floor=touches & FLOOR))
+    spheres, boxes = (ROBOT, touches & ~FLAT), (ROBOT, touches & ~ROUND)
+    classes = {
+        GEOM.mjGEOM_SPHERE: spheres,
+        GEOM.mjGEOM_CAPSULE: spheres,
+        GEOM.mjGEOM_BOX: boxes,
+        GEOM.mjGEOM_CYLINDER: (0, touches & (FLOOR | BALL)) if prisms else (ROBOT, touches),
+        GEOM.mjGEOM_MESH: (ROBOT, touches & ~(FLOOR | BALL | ROUND)),
+    }
+    style = Style(classes=classes, make_prism=functools.partial(_add_prism, spec) if prisms else None)
+    robot.build(root, style)
     robot.actuate(spec)
     for actuator in spec.actuators:
         actuator.ctrlrange = [-1, 1]
@@ -163,20 +173,18 @@ def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int, prisms: bool)
             solref=[0.02, 1.5],
             data=[0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0],  # anchor [3], relative position [3] and turn [4], torque scale
         )
-    if kind.circling:
-        classes = {"contype": GREMLIN, "conaffinity": 0}
-    elif kind.free:
-        classes = {"contype": MOVABLE, "conaffinity": FLOOR | FIXED}
-    else:
-        classes = {"contype": FIXED, "conaffinity": 0}
-    settings = classes | {"density": kind.density}
+    settings = {"contype": GREMLIN if kind.circling else MOVABLE, "density": kind.density}
+    settings["conaffinity"] = 0 if kind.circling else FLOOR | BALL | FLAT
     if kind.shape == "box":
         body.add_geom(name=name, type=GEOM.mjGEOM_BOX, size=[kind.size] * 3, **settings)
     elif kind.shape == "sphere":
-        body.add_geom(name=name, type=GEOM.mjGEOM_SPHERE, size=[kind.size, 0, 0], **settings)
+        body.add_geom(name=name, type=GEOM.mjGEOM_SPHERE, size=[kind.size, 0, 0], contype=BALL, conaffinity=0)
     elif kind.shape == "cylinder":
-        shape = GEOM.mjGEOM_CAPSULE if prisms else GEOM.mjGEOM_CYLINDER
-        body.add_geom(name=name, type=shape, size=[kind.size, kind.height, 0], **settings)
+        shape, classes = (GEOM.mjGEOM_CAPSULE, ROUND) if prisms else (GEOM.mjGEOM_CYLINDER, ROUND | FLAT)
+        body.add_geom(name=name, type=shape, size=[kind.size, kind.height, 0], contype=classes, conaffinity=0)
+        if prisms:
+            mesh = _add_prism(spec, kind.size, kind.height)
+            body.add_geom(type=GEOM.mjGEOM_MESH, meshname=mesh, contype=FLAT, conaffinity=0)
     elif kind.shape == "push_box":
         s = kind.size
         body.add_geom(name=name, type=GEOM.mjGEOM_BOX, size=[s, s, s], **settings)
