@@ -77,7 +77,8 @@ class Config:
     bootstrap_at_truncation: bool = _static(True, "use the critic's value at a time limit; false zeroes it (authors)")
 
     gamma: float = _traced(0.995, "discount of reward and cost (Table 1)")
-    gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation (Table 1)")
+    gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation, of the reward (Table 1)")
+    cost_gae_lambda: float = _traced(0.97, "the same, of the cost (Table 1)")
     max_kl: float = _traced(0.01, "trust-region radius, nats (Table 1)")
     kl_tolerance: float = _traced(1.5, "a step is accepted up to this multiple of max_kl (authors)")
     cg_damping: float = _traced(0.1, "added to the Fisher matrix's diagonal (authors)")
@@ -175,7 +176,7 @@ def validate(config: Config) -> None:
         value = getattr(config, name)
         if value is not None and not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"--{name} {value}: must be finite and not negative")
-    for name in ("gamma", "gae_lambda"):
+    for name in ("gamma", "gae_lambda", "cost_gae_lambda"):
         if getattr(config, name) > 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at most 1")
     if config.max_kl == 0:

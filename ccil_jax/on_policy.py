@@ -210,8 +210,9 @@ def assess(
     values = jax.vmap(critic_apply, in_axes=(0, None))
     value, next_value = values(state.critics.params, obs), values(state.critics.params, next_obs)
     no_future = transition.terminated if config.bootstrap_at_truncation else transition.done
-    both = jax.vmap(gae, in_axes=(0, 0, 0, None, None, None, None))
-    advantage, returns = both(signals, value, next_value, no_future, transition.done, config.gamma, config.gae_lambda)
+    lambdas = jnp.stack([jnp.asarray(config.gae_lambda), jnp.asarray(config.cost_gae_lambda)])
+    both = jax.vmap(gae, in_axes=(0, 0, 0, None, None, None, 0))
+    advantage, returns = both(signals, value, next_value, no_future, transition.done, config.gamma, lambdas)
 
     reward_advantage, cost_advantage = advantage[REWARD], advantage[COST]
     reward_advantage = (reward_advantage - jnp.mean(reward_advantage)) / (jnp.std(reward_advantage) + 1e-8)

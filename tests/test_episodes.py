@@ -17,7 +17,15 @@ from ccil_jax.types import Batch, PyTree, Transition
 from tests.probe_envs import Counter, Probe, Walk, quick_compilation, walk_config
 
 NUM_STEPS = 4  # of one batch
-COUNTER_CONFIG = Config(method="expert", cost_limit=12.5, num_envs=2, hidden_sizes=(2,), gamma=0.9, gae_lambda=0.5)
+COUNTER_CONFIG = Config(
+    method="expert",
+    cost_limit=12.5,
+    num_envs=2,
+    hidden_sizes=(2,),
+    gamma=0.9,
+    gae_lambda=0.5,
+    cost_gae_lambda=0.8,
+)
 
 
 def transition(**columns: Any) -> Transition:
@@ -234,7 +242,7 @@ def test_a_time_limit_bootstraps_from_the_last_state_and_not_from_the_reset(
     """V(s_T) = 50 for the reward and V(s_0) = 0, which is what a bootstrap from the reset state would add."""
     steps = counter_batches[1]
     batch = assess(steps, bootstrap_at_truncation=bootstrap)
-    for index, scale, signal in ((0, 10.0, steps.reward), (1, 100.0, steps.cost)):
+    for index, scale, signal, decay in ((0, 10.0, steps.reward, 0.5), (1, 100.0, steps.cost, 0.8)):
         expected = np.zeros((NUM_STEPS, 2))
         for n in range(2):
             following: Any = 0.0
@@ -242,7 +250,7 @@ def test_a_time_limit_bootstraps_from_the_last_state_and_not_from_the_reset(
                 shown, done = float(steps.obs[t, n, 0]), bool(steps.done[t, n])
                 future = 0.0 if done and not bootstrap else 0.9 * scale * (shown + 1)
                 residual = signal[t, n] + future - scale * shown
-                following = residual + (0.0 if done else 0.45 * following)
+                following = residual + (0.0 if done else 0.9 * decay * following)
                 expected[t, n] = following
         value = scale * steps.obs[..., 0]
         np.testing.assert_allclose(batch.returns[:, index], (expected + value).ravel(), rtol=1e-5)
