@@ -115,6 +115,18 @@ def still(env: SafetyGym, state: State) -> State:
     return jax.jit(env.step)(state, jnp.zeros(env.action_dim))
 
 
+def test_reset_to_needs_a_layout_and_the_engines_state_only(button_env: SafetyGym) -> None:
+    drawn = button_env.reset(jax.random.key(3)).physics
+    state = button_env.reset_to(drawn.layout, drawn.data.qpos, drawn.data.qvel, goal_button=2)
+    situation = button_env.situation(state.physics)
+    np.testing.assert_array_equal(situation.goal[:2], situation.objects["buttons"][2, :2])
+    np.testing.assert_array_equal(situation.robot, button_env.situation(drawn).robot)
+    again = button_env.reset_to(
+        drawn.layout, drawn.data.qpos, drawn.data.qvel, mocap_quat=drawn.mocap_quat, goal_button=drawn.goal_button
+    )
+    np.testing.assert_array_equal(again.obs, button_env.observe(drawn))
+
+
 @pytest.mark.parametrize(("distance", "cost"), [(0.19, 1.0), (0.21, 0.0)])
 def test_a_hazard_costs_while_the_robot_is_over_it(goal_env: SafetyGym, distance: float, cost: float) -> None:
     state = start(goal_env, {"hazards": [[distance, 0.0]] + [[9.0, 9.0]] * 7})
