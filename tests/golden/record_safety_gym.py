@@ -6,6 +6,11 @@ The original runs on Python 3.10 only, beside nothing else of this project:
     .venv310/bin/pip install safety-gymnasium==1.0.0   # brings mujoco 2.3.3, gymnasium 0.28.1, numpy 1.23.5
     .venv310/bin/python tests/golden/record_safety_gym.py --out tests/golden/safety_gym
 
+With another MuJoCo the original finds the contact points that this project's engine finds (the files are those of
+`mujoco_3.17/`, `--steps 40 --layouts 0`):
+
+    .venv310/bin/pip install --no-deps mujoco==3.17.0
+
 `<Task>.npz`, one for each task: R steps chosen from E episodes of 1000 steps. Lengths are in metres, angles in radians,
 times in seconds; everything is float64 unless another type is named. A state is MuJoCo's own: joints and actuators in
 the order of `joints` and `actuators` in the metadata, quaternions as (w, x, y, z).
