@@ -2,7 +2,8 @@
 
 Which seed is recorded: among the seeds whose mean evaluation cost is at most the limit, the one with the highest mean
 return. If none keeps the limit nothing is written and the exit status is 1. With --unconstrained there is no limit and
-the highest return wins. Episodes are recorded with the stochastic policy, as it was trained.
+the highest return wins. Episodes are recorded with the stochastic policy, as it was trained. Hyperparameters start from
+the preset `expert`, those of Safety Gym tasks from `safety_gym_expert`.
 """
 
 import argparse
@@ -20,7 +21,8 @@ from experiments.resuming import resumed
 from experiments.summary import number, show
 from experiments.training import Outcome, Plan, execute
 
-DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
+PRESETS = {"locomotion": "expert", "safety_gym": "safety_gym_expert"}  # of each family
+DEFAULTS = {**options.DEFAULTS, "preset": PRESETS["locomotion"]}
 
 
 def make_parser() -> Parser:
@@ -58,13 +60,14 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
     task = options.find_task(choices["env"])
     if not arguments.unconstrained:
         choices.setdefault("cost_limit", task.cost_limit)
-    config = options.config_from(choices, choices["preset"])
+    preset = given.get("preset", PRESETS[task.family])
+    config = options.config_from(choices, preset)
     folder = arguments.run_dir or command_line.default_folder(task.name, method)
     command_line.check_writable(arguments.out.parent, "--out")
     command_line.check_output_folder(folder, resume=arguments.resume, option="--run-dir")
     return Plan(
         config=config,
-        preset=choices["preset"],
+        preset=preset,
         task=task.name,
         physics=choices["physics"],
         env_options=options.env_options(choices, task),

@@ -54,6 +54,21 @@ def _every_option() -> list[str]:
     return given
 
 
+@pytest.mark.parametrize(
+    ("given", "preset"),
+    [
+        (["--env", "Swimmer"], "expert"),
+        (["--env", "PointGoal1"], "safety_gym_expert"),
+        (["--env", "PointGoal1", "--preset", "expert"], "expert"),
+    ],
+)
+def test_an_expert_starts_from_the_preset_of_its_family(given: list[str], preset: str, tmp_path: Path) -> None:
+    out = ["--out", str(tmp_path / "expert.npz"), "--run-dir", str(tmp_path / "run")]
+    plan = expert.make_plan(expert.make_parser().parse_args([*given, *out]))
+    assert plan.preset == preset
+    assert plan.config.batch_size == PRESETS[preset]["batch_size"]
+
+
 def test_the_expert_is_the_best_seed_within_the_limit() -> None:
     rows = [
         {"seed": 0, "episode_return": 50.0, "episode_cost": 31.0},
