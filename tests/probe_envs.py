@@ -17,7 +17,7 @@ from ccil_jax import networks
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.types import Batch, PyTree
-from envs.base import State
+from envs.base import State, first_state, next_state
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -51,35 +51,21 @@ class Probe:
         raise NotImplementedError
 
     def reset(self, key: jax.Array) -> State:
-        physics, zero, no = self.start(key), jnp.zeros(()), jnp.zeros((), bool)
-        return State(
-            physics=physics,
-            obs=self.observe(physics),
-            reward=zero,
-            cost=zero,
-            terminated=no,
-            truncated=no,
-            step_count=jnp.zeros((), jnp.int32),
-            episode_return=zero,
-            episode_cost=zero,
-            terms={},
-        )
+        physics = self.start(key)
+        return first_state(physics, self.observe(physics), ())
 
     def step(self, state: State, action: jax.Array) -> State:
         action = jnp.clip(action, -self.action_bound, self.action_bound)
         physics, reward, cost, terminated = self.advance(state.physics, action)
-        count = state.step_count + 1
-        return State(
+        return next_state(
+            state,
             physics=physics,
             obs=self.observe(physics),
             reward=reward,
             cost=cost,
             terminated=terminated,
-            truncated=(count >= self.max_episode_steps) & ~terminated,
-            step_count=count,
-            episode_return=state.episode_return + reward,
-            episode_cost=state.episode_cost + cost,
             terms={},
+            max_episode_steps=self.max_episode_steps,
         )
 
 
