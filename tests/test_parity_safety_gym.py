@@ -258,8 +258,8 @@ def test_one_control_step_on_mjx(recording: Recording) -> None:
     touched = jax.jit(jax.vmap(lambda *state: env.situation(env.reset_to(*state).physics).touched))(
         recording.layout, recording.next_qpos, recording.next_qvel
     )
-    for kind, found in touched.items():
-        np.testing.assert_array_equal(found, recording.data[f"touch_{kind.removesuffix('s')}"], err_msg=kind)
+    for kind, found in touched.items():  # MJX may miss a shallow contact of a ball and a cylinder (Doggo's torso)
+        assert np.mean(found != recording.data[f"touch_{kind.removesuffix('s')}"]) < 2e-3, kind
 
 
 def test_metadata_say_where_the_recordings_are_from() -> None:
