@@ -110,11 +110,6 @@ def run(arguments: argparse.Namespace) -> None:
         return
     settings = settings_of(arguments)
     command_line.check_writable(arguments.out.parent, "--out")
-    rows = []
-    for setting in settings:
-        print(f"measuring {setting['task']}, {setting['num_seeds']} seed(s) ...", file=sys.stderr, flush=True)
-        rows.append(measure_row(setting))
-    print_rows(rows)
     facts = {
         "command": command_line.command(),
         "versions": run_folder.versions(),
@@ -122,7 +117,12 @@ def run(arguments: argparse.Namespace) -> None:
         "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load_average": os.getloadavg(),
     }
-    run_folder.write_json(arguments.out, {**facts, "rows": rows})
+    rows: list[dict[str, Any]] = []
+    for setting in settings:
+        print(f"measuring {setting['task']}, {setting['num_seeds']} seed(s) ...", file=sys.stderr, flush=True)
+        rows.append(measure_row(setting))
+        run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
+    print_rows(rows)
     print(f"written to {arguments.out}")
 
 
