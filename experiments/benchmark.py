@@ -32,6 +32,12 @@ def make_parser() -> Parser:
     parser.add_argument("--method", default="malm", choices=METHOD_NAMES, help="what is trained (default: malm)")
     parser.add_argument("--physics", default="auto", choices=PHYSICS, help="engine (default: auto)")
     parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="hyperparameters (default: paper)")
+    parser.add_argument(
+        "--batch-size",
+        type=positive,
+        metavar="K",
+        help="steps per batch, where an engine is slow (default: the preset's)",
+    )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter measurements, for a first look")
     parser.add_argument("--seed", default=0, type=command_line.natural, metavar="N", help="base seed (default: 0)")
     parser.add_argument(
@@ -43,8 +49,9 @@ def make_parser() -> Parser:
 
 def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """One setting (see `measuring.Setting`) per row. Raises `UsageError` or `ConfigError` for wrong input."""
+    changes = {} if arguments.batch_size is None else {"batch_size": arguments.batch_size}
     method = {"method": arguments.method, "num_envs": arguments.num_envs, "cost_limit": 0.0}
-    options.config_from(method, arguments.preset)
+    options.config_from({**method, **changes}, arguments.preset)
     return [
         {
             "task": options.find_task(task, "--tasks").name,
@@ -56,6 +63,7 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             "rounds": 2 if arguments.quick else 5,
             "seconds": 0.3 if arguments.quick else 2.0,
             "seed": arguments.seed,
+            "changes": changes,
         }
         for task in arguments.tasks
         for num_seeds in arguments.num_seeds

@@ -4,7 +4,7 @@ import dataclasses
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -36,6 +36,7 @@ class Setting:
     rounds: int  # measurements of each kind, taken in turn
     seconds: float  # least duration of one measurement
     seed: int
+    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to the preset: fields of `Config`
 
 
 def measure(setting: Setting) -> dict[str, Any]:
@@ -46,7 +47,8 @@ def measure(setting: Setting) -> dict[str, Any]:
     controls: the ceiling of the native backend.
     """
     env: Any = envs.make(setting.task, physics=setting.physics)
-    config = Config(**{**PRESETS[setting.preset], "method": setting.method, "num_envs": setting.num_envs})
+    chosen = {"method": setting.method, "num_envs": setting.num_envs}
+    config = Config(**{**PRESETS[setting.preset], **setting.changes, **chosen})
     config = config.replace(env_steps=2 * config.steps_per_iteration)  # a chunk is two iterations
     training, compile_seconds = _training(config, env, setting)
     plain, meta = _policy_steps(config, env, setting)
@@ -71,6 +73,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         "num_seeds": setting.num_seeds,
         "num_envs": setting.num_envs,
         "num_substeps": env.num_substeps,
+        "changes": dict(setting.changes),
         "physics_steps_per_second": median["physics"],
         "rollout_steps_per_second": median["rollout"],
         "training_steps_per_second": median["training"],
