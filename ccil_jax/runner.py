@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 
 from ccil_jax import on_policy
 from ccil_jax.checkpointing import Checkpointer
-from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, validate
+from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, field_names, validate
 from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.on_policy import AgentState
 from ccil_jax.program import compile_program
@@ -31,8 +31,8 @@ class Progress:
 
     iteration: int  # finished so far
     num_iterations: int
-    metrics: History  # the new rows, [chunk, num_seeds] each
-    env_steps_per_second: float  # of this chunk, all seeds together
+    metrics: History  # the new rows, [chunk, num_runs] each
+    env_steps_per_second: float  # of this chunk, all runs together
     compile_seconds: float
 
 
@@ -122,17 +122,52 @@ def train(
     Raises:
         ConfigError: options, environment and demonstrations do not fit together.
     """
+    return train_runs(
+        [config],
+        env,
+        demonstrations,
+        num_seeds=num_seeds,
+        seed=seed,
+        checkpoint_dir=checkpoint_dir,
+        resume=resume,
+        on_progress=on_progress,
+        stop_after=stop_after,
+    )[0]
+
+
+def train_runs(
+    configs: Sequence[Config],
+    env: Environment,
+    demonstrations: Demonstrations | None = None,
+    *,
+    num_seeds: int = 1,
+    seed: int = 0,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+    stop_after: int | None = None,
+) -> list[Result]:
+    """Trains several configurations that differ in traced fields alone, each with the same seeds, in one program.
+
+    Its runs are [len(configs) * num_seeds], configuration after configuration: that is the order of the columns that
+    `on_progress` sees and of the states in a checkpoint. All else is as in `train`. Returns one result for each.
+
+    Raises:
+        ConfigError: also where the configurations differ in a static field.
+    """
     start = time.perf_counter()
-    config = resolve(config, env, demonstrations)
     if num_seeds < 1:
         raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
-    keys = jax.random.split(jax.random.key(seed), num_seeds)
+    configs = [resolve(config, env, demonstrations) for config in configs]
+    config, varied = join(configs, num_seeds)
+    num_runs = len(configs) * num_seeds
+    keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
     last = min(stop_after or config.num_iterations, config.num_iterations)
 
     with contextlib.ExitStack() as stack:
         checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
         done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
-        program = compile_program(config, env, expert_data(demonstrations), num_seeds, num_done=done)
+        program = compile_program(config, env, expert_data(demonstrations), num_runs, num_done=done, varied=varied)
         if checkpoints and done:
             like = {"state": program.state, "history": checkpoints.structure(done)["history"]}
             saved = checkpoints.restore(done, like)
@@ -151,7 +186,7 @@ def train(
                 checkpoints.save(done, {"state": state, "history": history})
                 saved_at = time.perf_counter()
             if on_progress:
-                rate = program.chunk_length * config.steps_per_iteration * num_seeds / elapsed
+                rate = program.chunk_length * config.steps_per_iteration * num_runs / elapsed
                 on_progress(
                     Progress(
                         iteration=done,
@@ -161,14 +196,48 @@ def train(
                         compile_seconds=program.compile_seconds,
                     )
                 )
-    return Result(
-        config=config,
-        metrics=history,
-        state=state,
-        env_steps=done * config.steps_per_iteration,
-        compile_seconds=program.compile_seconds,
-        wall_seconds=time.perf_counter() - start,
-    )
+    return [
+        Result(
+            config=config,
+            metrics={name: rows[:, own] for name, rows in history.items()},
+            state=jax.tree.map(lambda leaf, own=own: leaf[own], state) if len(configs) > 1 else state,
+            env_steps=done * config.steps_per_iteration,
+            compile_seconds=program.compile_seconds,
+            wall_seconds=time.perf_counter() - start,
+        )
+        for config, own in zip(configs, columns(len(configs), num_seeds), strict=True)
+    ]
+
+
+def columns(num_configs: int, num_seeds: int) -> list[slice]:
+    """Where each configuration's runs are among those of `train_runs`."""
+    return [slice(i * num_seeds, (i + 1) * num_seeds) for i in range(num_configs)]
+
+
+def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, jax.Array]]:
+    """What the configurations share, and the traced fields in which they differ as arrays [num_runs].
+
+    Raises:
+        ConfigError: a static field differs: these cannot share a program.
+    """
+    first = configs[0]
+    for name in field_names(traced=False):
+        values = sorted({str(getattr(config, name)) for config in configs})
+        if len(values) > 1:
+            raise ConfigError(f"{name} {' and '.join(values)}: only traced fields may differ within one program")
+    varied = {}
+    for name in field_names(traced=True):
+        of_config = [getattr(config, name) for config in configs]
+        if any(value != of_config[0] for value in of_config):
+            varied[name] = jnp.repeat(jnp.asarray(of_config, jnp.result_type(float)), num_seeds)
+    return first, varied
+
+
+def save(result: Result, directory: Path) -> None:
+    """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs."""
+    with Checkpointer(directory) as checkpoints:
+        iterations = result.env_steps // result.config.steps_per_iteration
+        checkpoints.save(iterations, {"state": result.state, "history": result.metrics})
 
 
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
@@ -202,9 +271,9 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
 
 
 def _rows(metrics: Metrics, done: int, config: Config) -> History:
-    """Metrics of a chunk [S, chunk] as rows [chunk, S], with the step counter."""
+    """Metrics of a chunk [R, chunk] as rows [chunk, R], with the step counter."""
     rows = {name: np.asarray(value).T for name, value in metrics.items()}
-    length, num_seeds = next(iter(rows.values())).shape
+    length, num_runs = next(iter(rows.values())).shape
     # Counted on the host: a 32-bit counter would overflow.
     env_steps = np.arange(done + 1, done + length + 1, dtype=np.int64) * config.steps_per_iteration
-    return {"env_steps": np.tile(env_steps[:, None], (1, num_seeds)), **rows}
+    return {"env_steps": np.tile(env_steps[:, None], (1, num_runs)), **rows}

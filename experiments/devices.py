@@ -18,7 +18,7 @@ def spread_seeds(num_seeds: int) -> None:
     """Asks JAX for that many CPU devices; no effect on accelerators. Call it before JAX is used."""
     num_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     num_devices = num_cpu_devices(num_seeds, num_cores)
-    # Enough threads that each device's program can wait for a LAPACK kernel (see `program.seed_mesh`); XLA reads the
+    # Enough threads that each device's program can wait for a LAPACK kernel (see `program.run_mesh`); XLA reads the
     # size of its pool from this variable.
     os.environ.setdefault("PJRT_NPROC", str(num_cores + num_devices))
     import jax

@@ -141,7 +141,7 @@ def _rollout(config: Config, env: Any, setting: Setting) -> Work:
         return state, jnp.mean(transition.reward)
 
     def spread(function: Callable[..., Any]) -> Callable[..., Any]:  # over devices, as training does
-        mesh, spec = program.seed_mesh(setting.num_seeds), jax.P("seeds")
+        mesh, spec = program.run_mesh(setting.num_seeds), jax.P("runs")
         return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
 
     keys = jax.random.split(jax.random.key(setting.seed), setting.num_seeds)
