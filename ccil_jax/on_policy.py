@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +26,10 @@ REWARD, COST = 0, 1  # order along every axis of length 2: critics, signals, dir
 
 
 class Agent(NamedTuple):
-    """What the runner knows of a learner: pure functions of one seed."""
+    """What the runner knows of a learner: pure functions of one seed. A state has a field `actor`, an `Actor`."""
 
-    init: Callable[[jax.Array], "AgentState"]
-    step: Callable[["AgentState"], tuple["AgentState", Metrics]]  # one iteration
+    init: Callable[[jax.Array], Any]  # key -> state
+    step: Callable[[Any], tuple[Any, Metrics]]  # one iteration
 
 
 @struct.dataclass(kw_only=True)
@@ -56,13 +56,16 @@ class AgentState:
     key: jax.Array
 
 
+def initial_std(env: Environment) -> np.ndarray:
+    """1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped."""
+    return np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
+
+
 def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     """Builds the agent of `config.method`. `config.cost_limit` must be set; `expert` is None for task rewards."""
     method = METHODS[config.method]
     constraint = method.constraint(config)
-    # 1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped.
-    initial_std = np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
-    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std)
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
     critic = networks.make_scalar(config, env.obs_dim)
     if method.reward == "discriminator":
         assert expert is not None, f"{config.method} learns from demonstrations"
