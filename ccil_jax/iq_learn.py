@@ -85,10 +85,8 @@ def loss(
     """
     reward = q - target
     on_expert = jnp.mean(reward[: len(reward) // 2])
-    if config.value_loss == "v0":
-        value_term = (1 - config.gamma) * jnp.mean(initial_value)
-    else:
-        value_term = jnp.mean(value - target)
+    v0 = config.value_loss == "v0"
+    value_term = (1 - config.gamma) * jnp.mean(initial_value) if v0 else jnp.mean(value - target)
     return value_term - on_expert + jnp.mean(reward**2) / (4 * config.chi2_coefficient)
 
 
