@@ -53,7 +53,7 @@ def make_variant(name: str, fields: Mapping[str, Any], out: Path, *, alone: bool
     """The variant with these `train` options. Raises `UsageError`, `ConfigError` or `DemonstrationsError`."""
     if "demos" in fields:  # a worker may be started elsewhere
         fields = {**fields, "demos": Path(fields["demos"]).resolve()}
-    return _variant(name, [f"--{field}={_text(value)}" for field, value in fields.items()], out, alone=alone)
+    return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, alone=alone)
 
 
 def _variant(name: str, given: Sequence[str], out: Path, *, alone: bool = False) -> Variant:
@@ -64,9 +64,10 @@ def _variant(name: str, given: Sequence[str], out: Path, *, alone: bool = False)
     return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
 
 
-def _text(value: Any) -> str:
+def text(value: Any) -> str:
+    """A value as it is typed on a command line."""
     if isinstance(value, list | tuple):
-        return ",".join(map(_text, value))
+        return ",".join(map(text, value))
     return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
