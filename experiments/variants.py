@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ccil_jax.config import field_names
+from ccil_jax.config import Config, field_names
 from experiments import run_folder, train
 from experiments.command_line import Parser, UsageError
 from experiments.training import Plan
@@ -96,10 +96,15 @@ def group(variants: Iterable[Variant], out: Path) -> list[Program]:
     return [_program(members, out) for members in groups.values()]
 
 
+def static_part(config: Config) -> tuple[Any, ...]:
+    """The values that shape a program."""
+    return tuple(getattr(config, name) for name in field_names(traced=False))
+
+
 def _shared(plan: Plan) -> tuple[Any, ...]:
     """What the plans of one program have in common."""
-    static = tuple(getattr(plan.config, name) for name in field_names(traced=False))
     expert = (plan.demonstrations_path, plan.demonstrations.num_episodes if plan.demonstrations else 0)
+    static = static_part(plan.config)
     return static, plan.task, plan.physics, str(plan.env_options), expert, plan.num_seeds, plan.seed, plan.eval_episodes
 
 
