@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ccil_jax.config import field_names
+from ccil_jax.config import Config, field_names
 from experiments import run_folder, train
 from experiments.command_line import Parser, UsageError
 from experiments.training import Plan
@@ -53,7 +53,7 @@ def make_variant(name: str, fields: Mapping[str, Any], out: Path, *, alone: bool
     """The variant with these `train` options. Raises `UsageError`, `ConfigError` or `DemonstrationsError`."""
     if "demos" in fields:  # a worker may be started elsewhere
         fields = {**fields, "demos": Path(fields["demos"]).resolve()}
-    return _variant(name, [f"--{field}={_text(value)}" for field, value in fields.items()], out, alone=alone)
+    return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, alone=alone)
 
 
 def _variant(name: str, given: Sequence[str], out: Path, *, alone: bool = False) -> Variant:
@@ -64,9 +64,10 @@ def _variant(name: str, given: Sequence[str], out: Path, *, alone: bool = False)
     return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
 
 
-def _text(value: Any) -> str:
+def text(value: Any) -> str:
+    """A value as it is typed on a command line."""
     if isinstance(value, list | tuple):
-        return ",".join(map(_text, value))
+        return ",".join(map(text, value))
     return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
@@ -95,10 +96,15 @@ def group(variants: Iterable[Variant], out: Path) -> list[Program]:
     return [_program(members, out) for members in groups.values()]
 
 
+def static_part(config: Config) -> tuple[Any, ...]:
+    """The values that shape a program."""
+    return tuple(getattr(config, name) for name in field_names(traced=False))
+
+
 def _shared(plan: Plan) -> tuple[Any, ...]:
     """What the plans of one program have in common."""
-    static = tuple(getattr(plan.config, name) for name in field_names(traced=False))
     expert = (plan.demonstrations_path, plan.demonstrations.num_episodes if plan.demonstrations else 0)
+    static = static_part(plan.config)
     return static, plan.task, plan.physics, str(plan.env_options), expert, plan.num_seeds, plan.seed, plan.eval_episodes
 
 
