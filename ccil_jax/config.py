@@ -9,8 +9,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-METHOD_NAMES = ("malm", "cvag", "ccil", "lgail", "gail", "bc", "iq_learn", "trpo", "expert")
-ADVERSARIAL_METHODS = frozenset({"malm", "cvag", "ccil", "lgail", "gail"})  # those with a discriminator
+METHOD_NAMES = ("malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il", "bc", "iq_learn", "trpo", "expert")
+ADVERSARIAL_METHODS = frozenset(
+    {"malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il"}
+)  # those with a discriminator
 IMITATION_METHODS = ADVERSARIAL_METHODS | {"bc", "iq_learn"}
 PRESCRIBED_LIMIT_METHODS = frozenset({"lgail", "expert"})
 
@@ -18,11 +20,13 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "method": METHOD_NAMES,
     "activation": ("tanh", "relu", "swish"),
     "meta_gradient": ("full", "direct", "indirect", "none"),
-    "multiplier_update": ("adam", "sgd"),
+    "outer_advantage": ("stale", "re-evaluated"),
+    "held_out_unit": ("transition", "trajectory"),
+    "multiplier_update": ("adam", "sgd", "pid", "optimal"),
     "meta_update": ("adam", "sgd"),
     "gate": ("batch", "episode"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
-    "discriminator_regularizer": ("none", "gradient_penalty"),
+    "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "value_loss": ("value", "v0"),
 }
 
@@ -61,7 +65,17 @@ class Config:
     hidden_sizes: tuple[int, ...] = _static((100, 100), "hidden layers of policy, critics and discriminator (Table 1)")
     activation: str = _static("tanh", "activation of every network (Table 1)")
     meta_gradient: str = _static("full", "outer step of malm: total derivative, one of its two parts, or none")
-    multiplier_update: str = _static("adam", "dual step: adam on softplus(xi) (authors) or projected sgd (Algorithm 1)")
+    outer_advantage: str = _static(
+        "stale", "outer loss of malm: advantages as the policy step saw them (authors), or by the updated networks"
+    )
+    held_out_unit: str = _static(
+        "transition", "what is drawn for the outer loss: steps (authors), or whole simulations' stretches of the batch"
+    )
+    multiplier_update: str = _static(
+        "adam",
+        "dual step: adam on softplus(xi) (authors), projected sgd (Algorithm 1), a pid controller, or the optimal "
+        "value for each single step",
+    )
     meta_update: str = _static(
         "adam", "outer step: adam on the multiplier's parameter (authors) or sgd on lambda (line 16)"
     )
@@ -101,6 +115,10 @@ class Config:
     multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)")
     meta_learning_rate: float = _traced(0.05, "outer step size, malm only (Table 1)")
     multiplier_max: float = _traced(100.0, "cap of the multiplier")
+    pid_proportional_gain: float = _traced(0.5, "of the smoothed cost gap, relative to the limit; pid only")
+    pid_integral_gain: float = _traced(0.05, "of the sum of relative gaps; pid only")
+    pid_derivative_gain: float = _traced(0.5, "of the rise of the smoothed relative gap; pid only")
+    pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap that stays; pid only")
     actor_learning_rate: float = _traced(1e-3, "Adam, policy of bc and iq_learn")
     target_update_rate: float = _traced(0.005, "Polyak average of iq_learn's target critic (published)")
     chi2_coefficient: float = _traced(0.5, "alpha of iq_learn's chi-square term, r^2 / (4 alpha) (published)")
@@ -127,7 +145,11 @@ class Config:
     @property
     def num_held_out(self) -> int:
         """V: samples kept for the outer loss; 0 for every method but malm."""
-        return int(self.held_out_fraction * self.batch_size) if self.method == "malm" else 0
+        if self.method != "malm":
+            return 0
+        if self.held_out_unit == "trajectory":
+            return int(self.held_out_fraction * self.num_envs) * self.num_steps
+        return int(self.held_out_fraction * self.batch_size)
 
     @property
     def num_training(self) -> int:
@@ -150,6 +172,24 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # classes part easily (HalfCheetah).
     "paper": {},
     "default": {"env_steps": 1_500_000},
+    # Algorithm 1 line by line: one full-batch step of the discriminator, lambda itself projected to [0, max], and the
+    # derivative of line 16 with the policy and its advantages held fixed.
+    "printed": {
+        "meta_gradient": "direct",
+        "multiplier_update": "sgd",
+        "meta_update": "sgd",
+        "discriminator_minibatch_size": 2000,
+        "discriminator_regularizer": "none",
+    },
+    # What the authors' code does: Adam on xi for both steps of the multiplier, CVAG's gate by episode, no value beyond
+    # a time limit. It counts the steps of one batch of the three, so its 1e7 are 3e7 here.
+    "authors": {
+        "meta_gradient": "direct",
+        "gate": "episode",
+        "bootstrap_at_truncation": False,
+        "discriminator_minibatch_size": 2000,
+        "discriminator_regularizer": "none",
+    },
     # No discriminator has to keep up with the policy: one larger batch and a wider trust region per iteration.
     "expert": {"env_steps": 2_000_000, "batch_size": 4000, "generator_steps": 1, "max_kl": 0.02, "gamma": 0.99},
     # Costs are rare here (some 25 visits of a hazard in 20,000 steps), so their gradient is mostly noise. Hence large
@@ -235,6 +275,13 @@ def validate(config: Config) -> None:
         )
     if not 0 <= config.held_out_fraction < 1:
         raise ConfigError(f"--held_out_fraction {config.held_out_fraction}: must be in [0, 1)")
+    if config.method == "malm" and config.multiplier_update not in ("adam", "sgd"):
+        raise ConfigError(
+            f"--multiplier_update {config.multiplier_update}: has no parameter for malm's outer step; use adam or sgd, "
+            f"or --method ccil"
+        )
+    if config.pid_smoothing >= 1:
+        raise ConfigError(f"--pid_smoothing {config.pid_smoothing}: must be below 1, or no gap is ever felt")
     if config.method == "malm" and config.meta_gradient != "none" and config.num_held_out == 0:
         raise ConfigError(
             f"--held_out_fraction {config.held_out_fraction}: malm's outer loss needs held-out samples; "

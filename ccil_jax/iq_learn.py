@@ -170,7 +170,8 @@ def updates(config: Config, policy: SquashedPolicy, critic: Network, action_dim:
 
 def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     """Builds the agent: acts in N simulations and after each step makes N `updates_per_step` updates."""
-    assert expert is not None, "iq_learn learns from demonstrations"
+    assert expert is not None and expert.transitions is not None, "iq_learn learns from demonstrations"
+    steps = expert.transitions
     policy = networks.make_squashed_policy(config, env)
     critic = networks.make_scalar(config, env.obs_dim + env.action_dim)
     update = updates(config, policy, critic, env.action_dim)
@@ -192,7 +193,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
 
     def minibatch(memory: Replay, key: jax.Array) -> Minibatch:
         expert_key, learner_key = jax.random.split(key)
-        size, steps = config.critic_minibatch_size, expert.transitions
+        size = config.critic_minibatch_size
         chosen = jax.random.randint(expert_key, (size,), 0, steps.terminated.shape[0])
         remembered = replay.choose(memory, size, learner_key)
 

@@ -92,7 +92,9 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             key=key,
         )
 
-    def generator_step(state: AgentState, key: jax.Array) -> tuple[AgentState, tuple[Transition, PolicyStep, Metrics]]:
+    def generator_step(
+        state: AgentState, key: jax.Array
+    ) -> tuple[AgentState, tuple[Transition, PolicyStep, jax.Array, Metrics]]:
         rollout_key, split_key, critic_key = jax.random.split(key, 3)
         rollout_state, transition = rollout.rollout(
             env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
@@ -103,9 +105,11 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
 
         episodes = episodes_of_steps(transition, limit, env.max_episode_steps)
         samples, mean_reward = assess(config, critic.apply, reward_model, constraint, state, transition, episodes)
-        held_out, training = policy_step.split(samples, config.num_held_out, split_key)
+        order = policy_step.random_order(config, split_key)
+        held_out, training = policy_step.split(samples, config.num_held_out, order)
+        step_gap = cost_gap / jnp.maximum(estimates.episode_length, 1.0)
         params, taken, step_metrics = policy_step.improve(
-            config, policy.apply, constraint, state.actor.policy_params, training, multiplier, cost_gap, held_out
+            config, policy.apply, constraint, state.actor.policy_params, training, multiplier, step_gap, held_out
         )
         critics, critic_losses = fit_critics(config, critic.apply, state.critics, training, critic_key)
 
@@ -124,16 +128,26 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             rollout=rollout_state,
             estimates=estimates,
         )
-        return new, (transition, taken, metrics)
+        return new, (transition, taken, order, metrics)
+
+    def reassess(state: AgentState, reward_state: PyTree, transition: Transition, order: jax.Array) -> Batch:
+        """The held-out samples of the last batch, with advantages by the updated critics and reward model."""
+        updated = dataclasses.replace(state, reward_model=reward_state)
+        episodes = episodes_of_steps(transition, limit, env.max_episode_steps)
+        samples, _ = assess(config, critic.apply, reward_model, constraint, updated, transition, episodes)
+        held_out, _ = policy_step.split(samples, config.num_held_out, order)
+        return held_out
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, generator_key, reward_key = jax.random.split(state.key, 3)
         generator_keys = jax.random.split(generator_key, config.generator_steps)
         state, outputs = jax.lax.scan(generator_step, state, generator_keys)
-        transition, taken, _ = jax.tree.map(lambda x: x[-1], outputs)
-        generator_metrics = outputs[2]
+        transition, taken, order, _ = jax.tree.map(lambda x: x[-1], outputs)
+        generator_metrics = outputs[3]
 
         reward_state, reward_metrics = reward_model.update(state.reward_model, transition, reward_key)
+        if config.num_held_out and config.outer_advantage == "re-evaluated":
+            taken = dataclasses.replace(taken, held_out=reassess(state, reward_state, transition, order))
         outer = policy_step.outer_problem(config, policy.apply, constraint, taken) if config.num_held_out else None
         cost_gap = state.estimates.episode_cost - limit
         constraint_state, constraint_metrics = constraint.update(state.constraint, cost_gap, outer)

@@ -61,4 +61,4 @@ class ExpertData:
     action: jax.Array  # [n, action_dim]
     held_out_obs: jax.Array  # [h, obs_dim] never trained on: shows a discriminator that memorises
     held_out_action: jax.Array  # [h, action_dim]
-    transitions: ExpertTransitions
+    transitions: ExpertTransitions | None = None  # what iq_learn learns from

@@ -27,6 +27,7 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "episode_length",
     "episodes_finished",
     "multiplier",
+    "cost_weight",
     "meta_gradient",
     "kl",
     "surrogate",

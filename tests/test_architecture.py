@@ -35,6 +35,7 @@ ORDER = (
     "trust_region",
     "regression",
     "reward_models",
+    "multipliers",
     "constraints",
     "methods",
     "policy_step",
