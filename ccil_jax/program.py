@@ -34,6 +34,7 @@ class Program:
     chunk: Callable[[PyTree], tuple[PyTree, Metrics]]  # state (donated) -> state, metrics [R, chunk_length]
     chunk_length: int
     compile_seconds: float
+    text: Callable[[], str]  # of `chunk`, as XLA has compiled it
 
 
 def run_mesh(num_runs: int) -> jax.sharding.Mesh:
@@ -48,6 +49,13 @@ def run_mesh(num_runs: int) -> jax.sharding.Mesh:
     return jax.make_mesh((size,), ("runs",), axis_types=(AxisType.Auto,), devices=devices[:size])
 
 
+def over_runs(function: Callable[..., Any], one_by_one: bool) -> Callable[..., Any]:
+    """`function` of one run as a function of several, [R]-leading: side by side, or in turn."""
+    if one_by_one:
+        return lambda *arguments: jax.lax.map(lambda of_run: function(*of_run), arguments)
+    return jax.vmap(function)
+
+
 def compile_program(
     config: Config,
     env: Environment,
@@ -55,6 +63,7 @@ def compile_program(
     num_runs: int,
     num_done: int = 0,
     varied: Varied = NONE_VARIED,
+    one_by_one: bool = False,
 ) -> Program:
     """`jit(vmap(scan(iteration)))` over runs, compiled once and spread over `run_mesh`.
 
@@ -65,6 +74,9 @@ def compile_program(
         num_runs: R.
         num_done: iterations behind a run that is continued: chunks lead from there to exactly `num_iterations`.
         varied: values [R] of the traced fields of `config` that are not the same in all runs, by name.
+        one_by_one: a device takes its runs in turn instead of side by side. Batched products are rounded otherwise
+            than single ones, so only then are the bits of a run the same however many share its device. XLA treats a
+            program for a single device differently, though: this holds among meshes of two devices or more.
     """
     common = math.gcd(config.num_iterations, num_done)
     chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if common % n == 0)
@@ -74,14 +86,14 @@ def compile_program(
         def init_run(values: Varied, key: jax.Array) -> PyTree:
             return agents.make(config.replace(**values), env, expert).init(key)
 
-        return jax.vmap(init_run)(varied, keys)
+        return over_runs(init_run, one_by_one)(varied, keys)
 
     def chunk(config: Config, expert: ExpertData | None, varied: Varied, state: PyTree) -> tuple[PyTree, Metrics]:
         def iterate(values: Varied, state: PyTree) -> tuple[PyTree, Metrics]:
             agent = agents.make(config.replace(**values), env, expert)
             return jax.lax.scan(lambda state, _: agent.step(state), state, None, length=chunk_length)
 
-        return jax.vmap(iterate)(varied, state)
+        return over_runs(iterate, one_by_one)(varied, state)
 
     def spread(function: Callable[..., Any]) -> Callable[..., Any]:
         # Runs never communicate, so each device carries out its share of them as a program of its own.
@@ -108,4 +120,5 @@ def compile_program(
         state=state,
         chunk_length=chunk_length,
         compile_seconds=time.perf_counter() - start,
+        text=compiled_chunk.as_text,
     )

@@ -124,6 +124,7 @@ def train(
     *,
     num_seeds: int = 1,
     seed: int = 0,
+    one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
@@ -137,6 +138,8 @@ def train(
         demonstrations: needed by the imitation methods.
         num_seeds: S.
         seed: of the S keys; the same seed and S give the same bits.
+        one_by_one: each device takes its seeds in turn, which is slower. Then a seed's bits do not depend on how many
+            seeds there are, nor on the number of devices, as long as there are two or more.
         checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
         resume: continue from the newest checkpoint in `checkpoint_dir`.
         on_progress: called after every chunk of iterations.
@@ -151,6 +154,7 @@ def train(
         demonstrations,
         num_seeds=num_seeds,
         seed=seed,
+        one_by_one=one_by_one,
         checkpoint_dir=checkpoint_dir,
         resume=resume,
         on_progress=on_progress,
@@ -165,6 +169,7 @@ def train_runs(
     *,
     num_seeds: int = 1,
     seed: int = 0,
+    one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
@@ -190,7 +195,9 @@ def train_runs(
     with contextlib.ExitStack() as stack:
         checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
         done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
-        program = compile_program(config, env, expert_data(demonstrations), num_runs, num_done=done, varied=varied)
+        program = compile_program(
+            config, env, expert_data(demonstrations), num_runs, num_done=done, varied=varied, one_by_one=one_by_one
+        )
         if checkpoints and done:
             like = {"state": program.state, "history": checkpoints.structure(done)["history"]}
             saved = checkpoints.restore(done, like)

@@ -70,6 +70,7 @@ def plan_of(given: Mapping[str, Any], folder: Path | None, *, resume: bool) -> P
         demonstrations_path=path,
         num_seeds=choices["num_seeds"],
         seed=choices["seed"],
+        one_by_one=choices["one_by_one"],
         folder=folder or command_line.default_folder(task.name, config.method),
         resume=resume,
         eval_episodes=choices["eval_episodes"],

@@ -33,6 +33,7 @@ class Plan:
     demonstrations_path: Path | None
     num_seeds: int
     seed: int
+    one_by_one: bool
     folder: Path
     resume: bool
     eval_episodes: int
@@ -81,7 +82,7 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
             f"{first.config.method} on {first.task}: {several}{first.num_seeds} seed(s), "
             f"{_length(first.config)} each, into {checkpoint_dir.parent}; compiling ..."
         )
-        devices.spread_seeds(num_runs)
+        devices.spread_seeds(num_runs, several=first.one_by_one)
         import envs  # with JAX behind it: not before the input has been checked
 
         env = envs.make(first.task, physics=first.physics, **first.env_options)
@@ -142,6 +143,7 @@ def _train(
             first.demonstrations,
             num_seeds=first.num_seeds,
             seed=first.seed,
+            one_by_one=first.one_by_one,
             checkpoint_dir=checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
             resume=any(plan.resume for plan in plans),
             on_progress=on_progress,
@@ -185,6 +187,7 @@ def _facts(plan: Plan, env: Any) -> dict[str, Any]:
         "preset": plan.preset,
         "command": plan.command,
         "seed": plan.seed,
+        "one_by_one": plan.one_by_one,
         "num_seeds": plan.num_seeds,
         "eval_episodes": plan.eval_episodes,
         "demonstrations": demonstrations,

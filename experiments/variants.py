@@ -78,7 +78,7 @@ def check_unchanged(variant: Variant) -> None:
         return
     run = run_folder.read_run(plan.folder)
     chosen = {**dataclasses.asdict(plan.config), "task": plan.task, "seed": plan.seed, "num_seeds": plan.num_seeds}
-    chosen |= {"eval_episodes": plan.eval_episodes, "env_options": plan.env_options}
+    chosen |= {name: getattr(plan, name) for name in ("eval_episodes", "env_options", "one_by_one")}
     saved = {**run.facts, **dataclasses.asdict(run.config)}
     for name, value in chosen.items():
         if saved[name] != value:
@@ -104,8 +104,8 @@ def static_part(config: Config) -> tuple[Any, ...]:
 def _shared(plan: Plan) -> tuple[Any, ...]:
     """What the plans of one program have in common."""
     expert = (plan.demonstrations_path, plan.demonstrations.num_episodes if plan.demonstrations else 0)
-    static = static_part(plan.config)
-    return static, plan.task, plan.physics, str(plan.env_options), expert, plan.num_seeds, plan.seed, plan.eval_episodes
+    names = ("task", "physics", "num_seeds", "seed", "one_by_one", "eval_episodes")
+    return static_part(plan.config), str(plan.env_options), expert, *(getattr(plan, name) for name in names)
 
 
 def _program(variants: Sequence[Variant], out: Path) -> Program:

@@ -1,5 +1,9 @@
 """Several configurations in one program: each run has its own numbers, and shares nothing with the others."""
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -84,3 +88,42 @@ def test_fields_that_agree_stay_numbers() -> None:
     np.testing.assert_array_equal(varied["multiplier_learning_rate"], np.float32([0.1, 0.1, 0.2, 0.2]))
     assert runner.join([config(1.0, 0.1, 0.0)] * 2, num_seeds=2)[1] == {}
     assert isinstance(varied["multiplier_learning_rate"], jax.Array)
+
+
+ON_FOUR_DEVICES = """
+import json, jax
+from ccil_jax import runner
+from ccil_jax.program import compile_program
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+
+env, demonstrations = Walk(), walk_demonstrations()
+expert, keys = runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 2)
+rates = (0.05, 0.01, 0.2)
+configs = [
+    runner.resolve(walk_config(method="malm", multiplier_learning_rate=rate), env, demonstrations) for rate in rates
+]
+shared, varied = runner.join(configs, num_seeds=2)
+alone = compile_program(configs[0], env, expert, 2, one_by_one=True)
+together = compile_program(shared, env, expert, 6, varied=varied, one_by_one=True)
+with quick_compilation():
+    side_by_side = compile_program(shared, env, expert, 4, varied={k: v[:4] for k, v in varied.items()})
+expected, found = alone.chunk(alone.init(keys)), together.chunk(together.init(jax.numpy.tile(keys, 3)))
+print(json.dumps({
+    "devices": [len(program.state.key.sharding.device_set) for program in (alone, together, side_by_side)],
+    "same": [same_bits(expected, jax.tree.map(lambda leaf: leaf[i : i + 2], found)) for i in (0, 2, 4)],
+    "collectives": [
+        f"{name} of {i}" for name in ("all-reduce", "all-gather", "collective-permute", "all-to-all", "reduce-scatter")
+        for i, program in enumerate((alone, together, side_by_side)) if name in program.text()
+    ],
+}))
+"""
+
+
+def test_devices_share_runs_without_a_word() -> None:
+    """Four CPU devices: nothing travels between them; taken in turn, a run has the same bits in any company."""
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "PJRT_NPROC": "16"}
+    environment["PYTHONPATH"] = str(Path(__file__).parent.parent)
+    command = [sys.executable, "-c", ON_FOUR_DEVICES]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"devices": [2, 3, 4], "same": [True, False, False], "collectives": []}
