@@ -13,8 +13,9 @@ def optimal_weights(
 ) -> Float[Array, " 2"]:
     """Weights of [x_r, x_c] whose step, scaled to the radius, is that of constrained policy optimisation.
 
-    Achiam et al. (2017). The step s maximises g_r.s subject to gap + g_c.s <= 0 and s.F s / 2 <= max_kl. Its solution lies on the radius (the
-    objective is linear), so a direction is all there is to find: x_r - nu x_c with the multiplier nu, from
+    Achiam et al. (2017). The step s maximises g_r.s subject to gap + g_c.s <= 0 and s.F s / 2 <= max_kl. Its solution
+    lies on the radius (the objective is linear), so a direction is all there is to find: x_r - nu x_c with the
+    multiplier nu, from
 
         q = g_r.x_r, r = g_r.x_c, s = g_c.x_c,  A = q - r^2 / s,  B = 2 max_kl - gap^2 / s
 
