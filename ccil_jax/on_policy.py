@@ -113,6 +113,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
         )
         critics, critic_losses = fit_critics(config, critic.apply, state.critics, training, critic_key)
 
+        assert state.actor.obs_statistics is not None
         statistics = running_statistics.update(state.actor.obs_statistics, transition.obs)
         metrics = step_metrics | {
             "episodes_finished": finished,

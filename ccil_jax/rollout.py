@@ -36,9 +36,8 @@ PolicyApply = Callable[[PyTree, jax.Array], Gaussian] | Callable[[PyTree, jax.Ar
 
 def act(policy_apply: PolicyApply, actor: Actor, obs: jax.Array, noise: jax.Array) -> jax.Array:
     """Actions [..., action_dim] for standard normal `noise`; zero noise gives the mode."""
-    if actor.obs_statistics is not None:
-        obs = running_statistics.normalize(actor.obs_statistics, obs)
-    return distributions.sample(policy_apply(actor.policy_params, obs), noise)
+    distribution = policy_apply(actor.policy_params, running_statistics.normalize(actor.obs_statistics, obs))
+    return distributions.sample(distribution, noise)
 
 
 def init(env: Environment, num_envs: int, key: jax.Array) -> RolloutState:
