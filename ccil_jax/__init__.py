@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ccil_jax.demonstrations import Demonstrations, load_demonstrations, save_demonstrations
     from ccil_jax.evaluation import evaluate
     from ccil_jax.methods import METHODS
-    from ccil_jax.runner import Result, train
+    from ccil_jax.runner import Result, train, train_runs
 
 __version__ = "0.1.0"
 
@@ -30,6 +30,7 @@ __all__ = [
     "load_demonstrations",
     "save_demonstrations",
     "train",
+    "train_runs",
 ]
 
 _HOMES = {
@@ -41,6 +42,7 @@ _HOMES = {
     "METHODS": "ccil_jax.methods",
     "Result": "ccil_jax.runner",
     "train": "ccil_jax.runner",
+    "train_runs": "ccil_jax.runner",
 }
 
 

@@ -3,21 +3,20 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import on_policy
+from ccil_jax import agents, iq_learn
 from ccil_jax.checkpointing import Checkpointer
-from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, validate
+from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, field_names, validate
 from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.on_policy import AgentState
 from ccil_jax.program import compile_program
 from ccil_jax.rollout import Actor
-from ccil_jax.types import ExpertData, Metrics
+from ccil_jax.types import ExpertData, ExpertTransitions, Metrics, PyTree
 from envs.base import Environment
 
 CHECKPOINT_SECONDS = 60.0  # at most this much work is lost, plus one chunk
@@ -31,8 +30,8 @@ class Progress:
 
     iteration: int  # finished so far
     num_iterations: int
-    metrics: History  # the new rows, [chunk, num_seeds] each
-    env_steps_per_second: float  # of this chunk, all seeds together
+    metrics: History  # the new rows, [chunk, num_runs] each
+    env_steps_per_second: float  # of this chunk, all runs together
     compile_seconds: float
 
 
@@ -42,7 +41,7 @@ class Result:
 
     config: Config  # as resolved: cost_limit is set
     metrics: History  # [iterations, num_seeds] each
-    state: AgentState  # [num_seeds]-leading
+    state: PyTree  # [num_seeds]-leading
     env_steps: int  # per seed
     compile_seconds: float
     wall_seconds: float  # of this call, compilation included
@@ -76,6 +75,14 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         config = config.replace(cost_limit=float(demonstrations.mean_episode_cost))
     elif config.cost_limit is None and config.method not in PRESCRIBED_LIMIT_METHODS:
         config = config.replace(cost_limit=0.0)  # enters nothing
+    if (
+        config.method == "iq_learn"
+        and demonstrations is not None
+        and demonstrations.num_steps == len(demonstrations.episode_ends)
+    ):
+        raise ConfigError("demonstrations: every trajectory is one step long, so no step's successor is known")
+    if config.method == "iq_learn" and config.temperature is None:
+        config = config.replace(temperature=iq_learn.TEMPERATURES.get(env.name, iq_learn.USUAL_TEMPERATURE))
     validate(config)
     return config
 
@@ -91,6 +98,22 @@ def expert_data(demonstrations: Demonstrations | None) -> ExpertData | None:
         action=jnp.asarray(demonstrations.actions[:num_training]),
         held_out_obs=jnp.asarray(demonstrations.obs[held_out]),
         held_out_action=jnp.asarray(demonstrations.actions[held_out]),
+        transitions=expert_transitions(demonstrations),
+    )
+
+
+def expert_transitions(demonstrations: Demonstrations) -> ExpertTransitions:
+    """The steps whose successor is known: an episode's last step is one only where the task ended."""
+    ends, obs = demonstrations.episode_ends, demonstrations.obs
+    last = np.zeros(len(obs), bool)
+    last[ends - 1] = True
+    known = np.flatnonzero(~last | demonstrations.terminated)
+    return ExpertTransitions(
+        obs=jnp.asarray(obs[known]),
+        action=jnp.asarray(demonstrations.actions[known]),
+        next_obs=jnp.asarray(obs[np.minimum(known + 1, len(obs) - 1)]),
+        terminated=jnp.asarray(demonstrations.terminated[known], jnp.result_type(float)),
+        initial_obs=jnp.asarray(obs[np.concatenate([[0], ends[:-1]])]),
     )
 
 
@@ -101,6 +124,7 @@ def train(
     *,
     num_seeds: int = 1,
     seed: int = 0,
+    one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
@@ -114,6 +138,8 @@ def train(
         demonstrations: needed by the imitation methods.
         num_seeds: S.
         seed: of the S keys; the same seed and S give the same bits.
+        one_by_one: each device takes its seeds in turn, which is slower. Then a seed's bits do not depend on how many
+            seeds there are, nor on the number of devices, as long as there are two or more.
         checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
         resume: continue from the newest checkpoint in `checkpoint_dir`.
         on_progress: called after every chunk of iterations.
@@ -122,17 +148,56 @@ def train(
     Raises:
         ConfigError: options, environment and demonstrations do not fit together.
     """
+    return train_runs(
+        [config],
+        env,
+        demonstrations,
+        num_seeds=num_seeds,
+        seed=seed,
+        one_by_one=one_by_one,
+        checkpoint_dir=checkpoint_dir,
+        resume=resume,
+        on_progress=on_progress,
+        stop_after=stop_after,
+    )[0]
+
+
+def train_runs(
+    configs: Sequence[Config],
+    env: Environment,
+    demonstrations: Demonstrations | None = None,
+    *,
+    num_seeds: int = 1,
+    seed: int = 0,
+    one_by_one: bool = False,
+    checkpoint_dir: Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+    stop_after: int | None = None,
+) -> list[Result]:
+    """Trains several configurations that differ in traced fields alone, each with the same seeds, in one program.
+
+    Its runs are [len(configs) * num_seeds], configuration after configuration: that is the order of the columns that
+    `on_progress` sees and of the states in a checkpoint. All else is as in `train`. Returns one result for each.
+
+    Raises:
+        ConfigError: also where the configurations differ in a static field.
+    """
     start = time.perf_counter()
-    config = resolve(config, env, demonstrations)
     if num_seeds < 1:
         raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
-    keys = jax.random.split(jax.random.key(seed), num_seeds)
+    configs = [resolve(config, env, demonstrations) for config in configs]
+    config, varied = join(configs, num_seeds)
+    num_runs = len(configs) * num_seeds
+    keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
     last = min(stop_after or config.num_iterations, config.num_iterations)
 
     with contextlib.ExitStack() as stack:
         checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
         done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
-        program = compile_program(config, env, expert_data(demonstrations), num_seeds, num_done=done)
+        program = compile_program(
+            config, env, expert_data(demonstrations), num_runs, num_done=done, varied=varied, one_by_one=one_by_one
+        )
         if checkpoints and done:
             like = {"state": program.state, "history": checkpoints.structure(done)["history"]}
             saved = checkpoints.restore(done, like)
@@ -151,7 +216,7 @@ def train(
                 checkpoints.save(done, {"state": state, "history": history})
                 saved_at = time.perf_counter()
             if on_progress:
-                rate = program.chunk_length * config.steps_per_iteration * num_seeds / elapsed
+                rate = program.chunk_length * config.steps_per_iteration * num_runs / elapsed
                 on_progress(
                     Progress(
                         iteration=done,
@@ -161,14 +226,47 @@ def train(
                         compile_seconds=program.compile_seconds,
                     )
                 )
-    return Result(
-        config=config,
-        metrics=history,
-        state=state,
-        env_steps=done * config.steps_per_iteration,
-        compile_seconds=program.compile_seconds,
-        wall_seconds=time.perf_counter() - start,
-    )
+    return [
+        Result(
+            config=config,
+            metrics={name: rows[:, own] for name, rows in history.items()},
+            state=jax.tree.map(lambda leaf, own=own: leaf[own], state) if len(configs) > 1 else state,
+            env_steps=done * config.steps_per_iteration,
+            compile_seconds=program.compile_seconds,
+            wall_seconds=time.perf_counter() - start,
+        )
+        for config, own in zip(configs, columns(len(configs), num_seeds), strict=True)
+    ]
+
+
+def columns(num_configs: int, num_seeds: int) -> list[slice]:
+    """Where each configuration's runs are among those of `train_runs`."""
+    return [slice(i * num_seeds, (i + 1) * num_seeds) for i in range(num_configs)]
+
+
+def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, jax.Array]]:
+    """What the configurations share, and the traced fields in which they differ as arrays [num_runs].
+
+    Raises:
+        ConfigError: a static field differs: these cannot share a program.
+    """
+    first = configs[0]
+    for name in field_names(traced=False):
+        values = sorted({str(getattr(config, name)) for config in configs})
+        if len(values) > 1:
+            raise ConfigError(f"{name} {' and '.join(values)}: only traced fields may differ within one program")
+    varied = {}
+    for name in field_names(traced=True):
+        of_config = [getattr(config, name) for config in configs]
+        if any(value != of_config[0] for value in of_config):
+            varied[name] = jnp.repeat(jnp.asarray(of_config, jnp.result_type(float)), num_seeds)
+    return first, varied
+
+
+def save(result: Result, directory: Path) -> None:
+    """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs."""
+    with Checkpointer(directory) as checkpoints:
+        checkpoints.save(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
 
 
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
@@ -177,16 +275,15 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     Raises:
         FileNotFoundError: there is no finished checkpoint.
     """
-    config = config.replace(cost_limit=config.cost_limit or 0.0)
-    steps = ExpertData(
-        obs=jnp.zeros((1, env.obs_dim)),
-        action=jnp.zeros((1, env.action_dim)),
-        held_out_obs=jnp.zeros((1, env.obs_dim)),
-        held_out_action=jnp.zeros((1, env.action_dim)),
-    )  # only their widths matter
+    config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
+    obs, action = jnp.zeros((1, env.obs_dim)), jnp.zeros((1, env.action_dim))
+    transitions = ExpertTransitions(obs=obs, action=action, next_obs=obs, terminated=jnp.zeros(1), initial_obs=obs)
+    steps = ExpertData(  # only their widths matter
+        obs=obs, action=action, held_out_obs=obs, held_out_action=action, transitions=transitions
+    )
 
-    def init(key: jax.Array) -> AgentState:
-        return jax.vmap(on_policy.make(config, env, steps).init)(jax.random.split(key, num_seeds))
+    def init(key: jax.Array) -> PyTree:
+        return jax.vmap(agents.make(config, env, steps).init)(jax.random.split(key, num_seeds))
 
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     like = jax.tree.map(
@@ -202,9 +299,9 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
 
 
 def _rows(metrics: Metrics, done: int, config: Config) -> History:
-    """Metrics of a chunk [S, chunk] as rows [chunk, S], with the step counter."""
+    """Metrics of a chunk [R, chunk] as rows [chunk, R], with the step counter."""
     rows = {name: np.asarray(value).T for name, value in metrics.items()}
-    length, num_seeds = next(iter(rows.values())).shape
+    length, num_runs = next(iter(rows.values())).shape
     # Counted on the host: a 32-bit counter would overflow.
     env_steps = np.arange(done + 1, done + length + 1, dtype=np.int64) * config.steps_per_iteration
-    return {"env_steps": np.tile(env_steps[:, None], (1, num_seeds)), **rows}
+    return {"env_steps": np.tile(env_steps[:, None], (1, num_runs)), **rows}

@@ -106,15 +106,20 @@ def default_folder(task: str, method: str) -> Path:
     return Path("runs") / f"{task}_{method}_{stamp}"
 
 
-def check_output_folder(folder: Path, *, resume: bool = False, option: str = "--out") -> None:
-    """Makes `folder` and proves that it can be written. Raises `UsageError`, also where runs would be mixed."""
+def check_output_folder(
+    folder: Path, *, resume: bool = False, option: str = "--out", record: str = "config.json"
+) -> None:
+    """Makes `folder` and proves that it can be written. Raises `UsageError`, also where runs would be mixed.
+
+    A folder with a file `record` holds a run that can be resumed.
+    """
     try:
-        holds_run = (folder / "config.json").is_file()
+        holds_run = (folder / record).is_file()
         occupied = folder.is_dir() and any(folder.iterdir())
     except OSError as error:
         raise UsageError(f"{option} {folder}: cannot be read ({error.strerror}); choose another folder") from None
     if resume and not holds_run:
-        raise UsageError(f"--resume: {folder} holds no run (no config.json); leave --resume out or correct {option}")
+        raise UsageError(f"--resume: {folder} holds no run (no {record}); leave --resume out or correct {option}")
     if holds_run and not resume:
         raise UsageError(f"{option} {folder}: already holds a run; continue it with --resume or choose another folder")
     if occupied and not resume:

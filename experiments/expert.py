@@ -75,6 +75,7 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         demonstrations_path=None,
         num_seeds=choices["num_seeds"],
         seed=choices["seed"],
+        one_by_one=choices["one_by_one"],
         folder=folder,
         resume=arguments.resume,
         eval_episodes=choices["eval_episodes"],

@@ -141,7 +141,7 @@ def _rollout(config: Config, env: Any, setting: Setting) -> Work:
         return state, jnp.mean(transition.reward)
 
     def spread(function: Callable[..., Any]) -> Callable[..., Any]:  # over devices, as training does
-        mesh, spec = program.seed_mesh(setting.num_seeds), jax.P("seeds")
+        mesh, spec = program.run_mesh(setting.num_seeds), jax.P("runs")
         return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
 
     keys = jax.random.split(jax.random.key(setting.seed), setting.num_seeds)
@@ -198,7 +198,9 @@ def _policy_steps(config: Config, env: Any, setting: Setting) -> tuple[Work, Wor
             returns=advantages.T,
             cost=(advantages[1] > 0).astype(advantages.dtype),
         )
-        return policy.init(params_key), *policy_step.split(batch, config.num_held_out, action_key)
+        return policy.init(params_key), *policy_step.split(
+            batch, config.num_held_out, policy_step.random_order(config, action_key)
+        )
 
     @jax.jit
     @jax.vmap

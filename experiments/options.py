@@ -14,9 +14,11 @@ from experiments.command_line import Parser, UsageError, boolean, integer, natur
 
 CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
 TASK_OPTIONS = ("cost_threshold", "contact_cost")  # some tasks have them; None leaves them to the task
+METHOD_PRESETS = {"bc": "bc", "iq_learn": "iq_learn"}  # where a method starts from one of its own
 DEFAULTS: Mapping[str, Any] = {
     "num_seeds": 3,
     "seed": 0,
+    "one_by_one": False,
     "physics": "auto",
     **dict.fromkeys(TASK_OPTIONS),
     "max_episode_steps": 1000,
@@ -36,6 +38,13 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
     add("env", f"task: {', '.join(TASKS)}", metavar="TASK")
     add("num_seeds", "seeds trained side by side in one program", type=positive, metavar="S")
     add("seed", "base seed: the same seed, number of seeds and versions give the same bits", type=natural, metavar="N")
+    add(
+        "one_by_one",
+        "whether a device takes its seeds in turn: slower, but the bits of a seed then depend neither on the number of "
+        "seeds (two or more) nor of cores",
+        type=boolean,
+        metavar="BOOL",
+    )
     add("preset", "hyperparameters to start from", choices=tuple(PRESETS))
     add("physics", "engine; auto is native on a CPU and mjx on an accelerator", choices=PHYSICS)
     add("cost_threshold", "per-step threshold of the 0/1 cost (default: the task's)", type=float, metavar="X")

@@ -22,6 +22,7 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
     saved = {
         **dataclasses.asdict(run.config),
         **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
+        "one_by_one": run.facts.get("one_by_one", False),  # older runs do not say
         **dict.fromkeys(options.TASK_OPTIONS),  # where the task has none; else:
         **run.facts["env_options"],
         "env": run.facts["task"],

@@ -19,8 +19,17 @@ from experiments.training import Plan, execute
 def make_parser() -> Parser:
     """Options that are not given stay absent, so that --resume can tell them from their defaults."""
     parser = Parser("train", __doc__ or "")
+    add_options(parser)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/<task>_<method>_<time>)")
+    parser.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
+    return parser
+
+
+def add_options(parser: Parser, *, with_method: bool = True) -> None:
+    """What a run is: all but where it goes."""
     absent = argparse.SUPPRESS
-    parser.add_argument("--method", default=absent, metavar="NAME", help=f"one of {', '.join(METHOD_NAMES)}")
+    if with_method:
+        parser.add_argument("--method", default=absent, metavar="NAME", help=f"one of {', '.join(METHOD_NAMES)}")
     options.add_run_options(parser)
     parser.add_argument(
         "--demos", default=absent, type=Path, metavar="FILE", help="demonstrations (default: those shipped for --env)"
@@ -28,10 +37,7 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--num-demos", default=absent, type=command_line.positive, metavar="K", help="use the first K trajectories only"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/<task>_<method>_<time>)")
-    parser.add_argument("--resume", action="store_true", help="continue the run in --out from its last checkpoint")
     options.add_config_options(parser, options.DEFAULTS["preset"], hide=("method",))
-    return parser
 
 
 def make_plan(arguments: argparse.Namespace) -> Plan:
@@ -39,15 +45,21 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
     given = {k: v for k, v in vars(arguments).items() if k not in ("out", "resume")}
     if arguments.resume:
         given = resumed(arguments.out, given)
-    elif "method" not in given:
+    plan = plan_of(given, arguments.out, resume=arguments.resume)
+    command_line.check_output_folder(plan.folder, resume=plan.resume)
+    return plan
+
+
+def plan_of(given: Mapping[str, Any], folder: Path | None, *, resume: bool) -> Plan:
+    """The `Plan` of the options given, checked, but for its folder (a new one where it is None)."""
+    if "method" not in given:
         raise UsageError(f"--method: required; one of {', '.join(METHOD_NAMES)}")
-    choices = {**options.DEFAULTS, "env": None, "demos": None, "num_demos": None, **given}
+    preset = options.METHOD_PRESETS.get(given["method"], options.DEFAULTS["preset"])
+    choices = {**options.DEFAULTS, "preset": preset, "env": None, "demos": None, "num_demos": None, **given}
     config = options.config_from(choices, choices["preset"])
     task = options.find_task(choices["env"])
     env_options = options.env_options(choices, task)
     path, demonstrations = find_demonstrations(config, task, choices["demos"], choices["num_demos"], env_options)
-    folder = arguments.out or command_line.default_folder(task.name, config.method)
-    command_line.check_output_folder(folder, resume=arguments.resume)
     return Plan(
         config=config,
         preset=choices["preset"],
@@ -58,8 +70,9 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         demonstrations_path=path,
         num_seeds=choices["num_seeds"],
         seed=choices["seed"],
-        folder=folder,
-        resume=arguments.resume,
+        one_by_one=choices["one_by_one"],
+        folder=folder or command_line.default_folder(task.name, config.method),
+        resume=resume,
         eval_episodes=choices["eval_episodes"],
         command=command_line.command(),
     )

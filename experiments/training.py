@@ -1,6 +1,8 @@
-"""One training run from checked choices to a finished run folder; shared by `train` and `expert`."""
+"""Training runs from checked choices to finished run folders; shared by `train`, `expert` and `sweep_worker`."""
 
+import contextlib
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +33,7 @@ class Plan:
     demonstrations_path: Path | None
     num_seeds: int
     seed: int
+    one_by_one: bool
     folder: Path
     resume: bool
     eval_episodes: int
@@ -63,58 +66,107 @@ class Outcome:
 
 def execute(plan: Plan) -> Outcome:
     """Trains, evaluates, writes the whole run folder and prints the table."""
-    with Display(f"{plan.config.method} {plan.task}", plan.config.num_iterations, plan.cost_limit) as display:
+    return execute_together([plan], plan.folder / "checkpoints")[0]
+
+
+def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcome]:
+    """Carries out plans that differ in traced hyperparameters and folders alone as one program.
+
+    `checkpoint_dir` holds the checkpoints of all their runs together; in the end each folder has those of its own.
+    """
+    first = plans[0]
+    num_runs = sum(plan.num_seeds for plan in plans)
+    with Display(f"{first.config.method} {first.task}", first.config.num_iterations, first.cost_limit) as display:
+        several = f"{len(plans)} configurations of " if len(plans) > 1 else ""
         display.message(
-            f"{plan.config.method} on {plan.task}: {plan.num_seeds} seed(s), {plan.config.env_steps:,} steps each, "
-            f"into {plan.folder}; compiling ..."
+            f"{first.config.method} on {first.task}: {several}{first.num_seeds} seed(s), "
+            f"{_length(first.config)} each, into {checkpoint_dir.parent}; compiling ..."
         )
-        devices.spread_seeds(plan.num_seeds)
+        devices.spread_seeds(num_runs, several=first.one_by_one)
         import envs  # with JAX behind it: not before the input has been checked
 
-        env = envs.make(plan.task, physics=plan.physics, **plan.env_options)
-        # A resumed run was made by all its commands: the first, and those that continued it.
-        earlier = [run_folder.read_run(plan.folder).facts["command"]] if plan.resume else []
-        plan = dataclasses.replace(plan, command="\n".join([*earlier, plan.command]))
-        run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
-        result, rate = _train(plan, env, display)
-        display.message(f"evaluating {plan.eval_episodes} episodes per seed ...")
-        from ccil_jax import evaluation
-
-        evaluated = evaluation.evaluate(
-            result.config, result.agent, env, num_episodes=plan.eval_episodes, seed=plan.evaluation_seed
+        env = envs.make(first.task, physics=first.physics, **first.env_options)
+        plans = [_with_earlier_commands(plan) for plan in plans]
+        for plan in plans:
+            run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
+        results, rate = _train(plans, env, checkpoint_dir, display)
+        display.message(f"evaluating {first.eval_episodes} episodes per seed ...")
+        evaluations, random = _evaluate(plans, results, env)
+    return [
+        Outcome(
+            plan=plan,
+            result=result,
+            env=env,
+            evaluation=evaluated,
+            random=random,
+            summary=_finish(plan, result, rate, num_runs, evaluated, random),
         )
-        random = evaluation.random_policy(env, num_episodes=plan.eval_episodes, seed=plan.evaluation_seed)
-    content = _finish(plan, result, rate, evaluated, random)
-    return Outcome(plan=plan, result=result, env=env, evaluation=evaluated, random=random, summary=content)
+        for plan, result, evaluated in zip(plans, results, evaluations, strict=True)
+    ]
 
 
-def _train(plan: Plan, env: Any, display: Display) -> tuple["Result", float | None]:
-    """The result, and environment steps per second of all seeds, compilation aside (None if nothing was left to do)."""
+def _length(config: Config) -> str:
+    return f"{config.bc_epochs} passes" if config.method == "bc" else f"{config.env_steps:,} steps"
+
+
+def _with_earlier_commands(plan: Plan) -> Plan:
+    """A resumed run was made by all its commands: the first, and those that continued it."""
+    earlier = [run_folder.read_run(plan.folder).facts["command"]] if plan.resume else []
+    return dataclasses.replace(plan, command="\n".join([*earlier, plan.command]))
+
+
+def _train(
+    plans: Sequence[Plan], env: Any, checkpoint_dir: Path, display: Display
+) -> tuple[list["Result"], float | None]:
+    """The results, and environment steps per second of all runs, compilation aside (None if nothing was left to do)."""
     from ccil_jax import runner
 
-    steps = seconds = 0.0
+    first, steps, seconds = plans[0], 0.0, 0.0
+    own = runner.columns(len(plans), first.num_seeds)
 
-    with run_folder.MetricsWriter(plan.folder) as writer:
+    with contextlib.ExitStack() as stack:
+        writers = [stack.enter_context(run_folder.MetricsWriter(plan.folder)) for plan in plans]
 
         def on_progress(progress: "Progress") -> None:
             nonlocal steps, seconds
-            new_steps = progress.metrics["env_steps"].size * plan.config.steps_per_iteration
+            new_steps = progress.metrics["env_steps"].size * first.config.steps_per_iteration
             steps += new_steps
-            seconds += new_steps / progress.env_steps_per_second
-            writer.write(progress.iteration, progress.metrics)
+            if new_steps:  # behaviour cloning takes none
+                seconds += new_steps / progress.env_steps_per_second
+            for writer, columns in zip(writers, own, strict=True):
+                writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
             display.update(progress)
 
-        result = runner.train(
-            plan.config,
+        results = runner.train_runs(
+            [plan.config for plan in plans],
             env,
-            plan.demonstrations,
-            num_seeds=plan.num_seeds,
-            seed=plan.seed,
-            checkpoint_dir=plan.folder.resolve() / "checkpoints",  # orbax fails in the background on a relative path
-            resume=plan.resume,
+            first.demonstrations,
+            num_seeds=first.num_seeds,
+            seed=first.seed,
+            one_by_one=first.one_by_one,
+            checkpoint_dir=checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
+            resume=any(plan.resume for plan in plans),
             on_progress=on_progress,
         )
-    return result, steps / seconds if seconds else None
+    for plan, result in zip(plans, results, strict=True):
+        if (directory := plan.folder / "checkpoints") != checkpoint_dir:
+            runner.save(result, directory)
+    return results, steps / seconds if seconds else None
+
+
+def _evaluate(plans: Sequence[Plan], results: Sequence["Result"], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:
+    """Evaluations of all plans, in one program, and that of the random policy."""
+    import jax
+
+    from ccil_jax import evaluation, runner
+
+    first = plans[0]
+    settings: Any = {"num_episodes": first.eval_episodes, "seed": first.evaluation_seed}
+    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for result in results])
+    together = evaluation.evaluate(results[0].config, agents, env, **settings)
+    own = runner.columns(len(plans), first.num_seeds)
+    evaluations = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], together) for rows in own]
+    return evaluations, evaluation.random_policy(env, **settings)
 
 
 def _facts(plan: Plan, env: Any) -> dict[str, Any]:
@@ -135,6 +187,7 @@ def _facts(plan: Plan, env: Any) -> dict[str, Any]:
         "preset": plan.preset,
         "command": plan.command,
         "seed": plan.seed,
+        "one_by_one": plan.one_by_one,
         "num_seeds": plan.num_seeds,
         "eval_episodes": plan.eval_episodes,
         "demonstrations": demonstrations,
@@ -146,7 +199,12 @@ def _facts(plan: Plan, env: Any) -> dict[str, Any]:
 
 
 def _finish(
-    plan: Plan, result: "Result", rate: float | None, evaluated: "Evaluation", random: "Evaluation"
+    plan: Plan,
+    result: "Result",
+    rate: float | None,
+    num_runs: int,
+    evaluated: "Evaluation",
+    random: "Evaluation",
 ) -> dict[str, Any]:
     """Writes summary and figures, prints the table, returns the summary."""
     from experiments import figures  # imports matplotlib: no argument error should wait for it
@@ -159,7 +217,7 @@ def _finish(
         cost_limit=plan.config.cost_limit,
     )
     metrics = run_folder.read_metrics(plan.folder)
-    rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1], reference)
+    rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
     content = {
         "task": plan.task,
@@ -170,7 +228,8 @@ def _finish(
         "per_seed": rows,
         "aggregate": aggregate,
         "env_steps": result.env_steps,
-        "env_steps_per_second": rate,
+        "env_steps_per_second": rate,  # of all runs that shared the program
+        "runs_in_program": num_runs,
         "wall_seconds": result.wall_seconds,
         "compile_seconds": result.compile_seconds,
     }

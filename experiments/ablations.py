@@ -1,0 +1,187 @@
+"""Trains variants of MALM and CVAG that differ in one choice, and says what each choice is worth.
+
+Choices that are numbers inside the program share one compilation; the baselines and every other choice have a program
+of their own, as many runs each, so that their speeds compare. A question's first variant is its baseline.
+"""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.config import PRESETS, Config
+from experiments import command_line, comparison, options, study, train
+from experiments.command_line import Parser, UsageError
+from experiments.comparison import Row
+from experiments.variants import Variant, make_variant
+
+
+@dataclasses.dataclass(frozen=True)
+class Question:
+    """One choice: what to ask, of which method, and the changes of `Config` behind each answer, baseline first."""
+
+    text: str
+    method: str
+    answers: Mapping[str, Mapping[str, Any]]
+
+
+def _one_field(text: str, field: str, values: Sequence[Any], method: str = "malm") -> Question:
+    return Question(text, method, {str(value): {field: value} for value in values})
+
+
+QUESTIONS: Mapping[str, Question] = {
+    "meta_gradient": _one_field(
+        "Does the multiplier's gradient through the policy step help?",
+        "meta_gradient",
+        ("full", "direct", "indirect", "none"),
+    ),
+    "multiplier_update": Question(
+        "Which dual step?",
+        "malm",
+        {
+            "adam": {"multiplier_update": "adam"},
+            "sgd, 0.05 (as printed)": {"multiplier_update": "sgd", "multiplier_learning_rate": 0.05},
+            "sgd, 0.0005": {"multiplier_update": "sgd", "multiplier_learning_rate": 0.0005},
+        },
+    ),
+    "multiplier": Question(
+        "Whose multiplier, without a meta-gradient?",
+        "ccil",
+        {
+            "adam": {"multiplier_update": "adam"},
+            "sgd, 0.0005": {"multiplier_update": "sgd", "multiplier_learning_rate": 0.0005},
+            "pid": {"multiplier_update": "pid"},
+            "optimal": {"multiplier_update": "optimal"},
+        },
+    ),
+    "preset": Question(
+        "The algorithm as printed, or as its authors coded it?",
+        "malm",
+        {"paper": {}, **{name: PRESETS[name] for name in ("printed", "authors")}},
+    ),
+    "outer_advantage": _one_field(
+        "Whose advantages judge the outer step?", "outer_advantage", ("stale", "re-evaluated")
+    ),
+    "held_out_unit": _one_field("What is held out for it?", "held_out_unit", ("transition", "trajectory")),
+    "multiplier_learning_rate": _one_field("How large a dual step?", "multiplier_learning_rate", (0.05, 0.01, 0.2)),
+    "meta_learning_rate": _one_field("How large an outer step?", "meta_learning_rate", (0.05, 0.01, 0.2)),
+    "windup": _one_field("Does a multiplier that begins too high come down?", "initial_multiplier", (0.01, 1.0, 10.0)),
+    "gate": _one_field("One decision per batch or per episode?", "gate", ("batch", "episode"), method="cvag"),
+    "reward_form": _one_field("Which imitation reward?", "reward_form", ("softplus", "logit", "log_sigmoid")),
+    "discriminator_regularizer": _one_field(
+        "What keeps the discriminator smooth?",
+        "discriminator_regularizer",
+        ("gradient_penalty", "none", "spectral_norm"),
+    ),
+    "standardize_cost_advantage": _one_field(
+        "Is the cost advantage standardised?", "standardize_cost_advantage", (False, True)
+    ),
+}
+COLUMNS = {
+    "question": "question",
+    "answer": "answer",
+    "recovered_return": "recovered return, %",
+    "relative_cost_violation": "relative violation",
+    "final_multiplier": "final lambda",
+    "max_multiplier": "highest",
+    "windup": "wound up",
+    "relative_speed": "steps/s : baseline",
+}
+_OWN = ("questions", "workers", "launcher", "slurm", "out", "resume")
+
+
+def make_parser() -> Parser:
+    """The options of this launcher: those of `train`, which all variants share, and where to carry them out."""
+    parser = Parser("ablations", __doc__ or "")
+    parser.add_argument(
+        "--questions",
+        nargs="+",
+        choices=tuple(QUESTIONS),
+        default=tuple(QUESTIONS),
+        metavar="NAME",
+        help=f"of {', '.join(QUESTIONS)} (default: all)",
+    )
+    study.add_options(parser)
+    train.add_options(parser, with_method=False)
+    return parser
+
+
+def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tuple[str, str], Variant]:
+    """The variant behind each (question, answer); the same variant where two answers come to the same `Config`."""
+    found: dict[str, Variant] = {}
+    answers = {}
+    for name in names:
+        question = QUESTIONS[name]
+        fields = {**shared, "method": question.method}
+        plain = options.config_from({**options.DEFAULTS, **fields}, fields.get("preset", options.DEFAULTS["preset"]))
+        for i, (answer, changes) in enumerate(question.answers.items()):
+            folder = _name(plain, changes)
+            baseline = i == 0
+            if folder not in found or (baseline and not found[folder].alone):
+                found[folder] = make_variant(folder, {**fields, **changes}, out, alone=baseline)
+            answers[name, answer] = found[folder]
+    return {key: found[variant.name] for key, variant in answers.items()}
+
+
+def _name(plain: Config, changes: Mapping[str, Any]) -> str:
+    different = (f"{field}={value}" for field, value in changes.items() if getattr(plain, field) != value)
+    return ",".join([plain.method, *different])
+
+
+def rows_of(answers: Mapping[tuple[str, str], Variant]) -> list[Row]:
+    """One row for each answer whose variant is finished, with its speed relative to the question's baseline."""
+    rows, baselines = [], {}
+    for (question, answer), variant in answers.items():
+        if not variant.finished:
+            continue
+        row = {"question": question, "answer": answer, **comparison.row(variant)}
+        if answer == next(iter(QUESTIONS[question].answers)):
+            baselines[question] = row
+        rows.append(row | {"relative_speed": _relative_speed(row, baselines.get(question))})
+    return rows
+
+
+def _relative_speed(row: Row, baseline: Row | None) -> float | None:
+    """None where it would mean nothing: programs of different numbers of runs, or one that was only resumed."""
+    if baseline is None or row["runs_in_program"] != baseline["runs_in_program"]:
+        return None
+    rates = row["env_steps_per_second"], baseline["env_steps_per_second"]
+    return rates[0] / rates[1] if all(rates) else None
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Trains what is missing, then writes ablations.csv and ablations.png; status 1 if a program failed."""
+    shared = {name: value for name, value in vars(arguments).items() if name not in _OWN}
+    task = options.find_task(shared.get("env"))
+    answers = ask(arguments.questions, shared, arguments.out)
+    different = list({variant.name: variant for variant in answers.values()}.values())
+    choices = {name: str(value) for name, value in shared.items()}
+    num_failed = study.carry_out(different, arguments, "ablations.json", choices)
+    rows = rows_of(answers)
+    if not rows:
+        raise UsageError(f"--out {arguments.out}: no variant was finished; see the worker.log of each program there")
+    comparison.write_csv(arguments.out / "ablations.csv", rows)
+    from experiments import comparison_figures  # imports matplotlib
+
+    figure = arguments.out / "ablations.png"
+    seeds = f"{rows[0]['num_seeds']} seeds, {rows[0]['env_steps']:,} steps each"
+    title = f"{task.name}, {seeds}: interquartile mean and 95 % interval, dots: seeds, dashed: the expert"
+    groups = {q.text: [row for row in rows if row["question"] == name] for name, q in QUESTIONS.items()}
+    comparison_figures.draw_groups(figure, {k: v for k, v in groups.items() if v}, "answer", title)
+    comparison.print_rows(f"{task.name}, {seeds}: IQM [95 % interval]", COLUMNS, rows, section="question")
+    print(
+        "wound up: share of the iterations with the cost below its limit and lambda above its final value\n"
+        f"table   {arguments.out / 'ablations.csv'}\nfigure  {figure}"
+    )
+    return 1 if num_failed else 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

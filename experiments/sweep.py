@@ -1,0 +1,141 @@
+"""Trains a grid of hyperparameters in as few programs as it takes, and compares them in one table and one figure.
+
+SPEC is a TOML or JSON file. Its fields are the options of `train`; those under `grid` take several values each:
+
+    env = "Swimmer"
+    method = "malm"
+
+    [fixed]
+    num_seeds = 3
+    env_steps = 300000
+
+    [grid]
+    multiplier_learning_rate = [0.01, 0.05, 0.2]
+    hidden_sizes = [[64, 64], [100, 100]]
+
+Numbers inside the program, such as learning rates, share a program with all their seeds; every other field, such as
+task, method or sizes, makes programs of its own. These run in worker processes here, on a Ray cluster, or under SLURM;
+a worker that dies is replaced once. What is finished stays finished: an interrupted sweep goes on with --resume.
+"""
+
+import argparse
+import itertools
+import json
+import sys
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.config import ConfigError
+from ccil_jax.demonstrations import DemonstrationsError
+from experiments import command_line, comparison, study
+from experiments.command_line import Parser, UsageError
+from experiments.variants import Variant, make_variant, text
+
+_KEYS = ("env", "method", "fixed", "grid")
+_LONGEST_NAME = 120  # of a folder
+_COLUMNS = {
+    "variant": "variant",
+    "episode_return": "return",
+    "episode_cost": "cost",
+    "recovered_return": "recovered return, %",
+    "relative_cost_violation": "relative violation",
+    "final_multiplier": "final lambda",
+}
+
+
+def make_parser() -> Parser:
+    """The options of this launcher."""
+    parser = Parser("sweep", __doc__ or "")
+    parser.add_argument("spec", type=Path, metavar="SPEC", help="TOML or JSON file that names what to train")
+    study.add_options(parser)
+    return parser
+
+
+def read_spec(path: Path) -> dict[str, Any]:
+    """The content of a spec, its tables present. Raises `UsageError` if it is missing or not of that form."""
+    loaders = {".toml": tomllib.loads, ".json": json.loads}
+    if path.suffix not in loaders:
+        raise UsageError(f"SPEC {path}: give a file named *.toml or *.json")
+    try:
+        spec = loaders[path.suffix](path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"SPEC {path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise UsageError(f"SPEC {path}: not {path.suffix[1:].upper()} ({error})") from None
+    if not isinstance(spec, dict):
+        raise UsageError(f"SPEC {path}: give a table with {', '.join(_KEYS)}")
+    if unknown := [key for key in spec if key not in _KEYS]:
+        raise UsageError(f"SPEC {path}: '{unknown[0]}': unknown; give env, method, and the rest under fixed or grid")
+    spec = {"fixed": {}, "grid": {}, **spec}
+    for table in ("fixed", "grid"):
+        if not isinstance(spec[table], dict):
+            raise UsageError(f"SPEC {path}: {table}: give a table of fields")
+    _check_grid(path, spec)
+    return spec
+
+
+def _check_grid(path: Path, spec: Mapping[str, Any]) -> None:
+    if not spec["grid"]:
+        raise UsageError(f"SPEC {path}: grid: empty; give at least one field with a list of values")
+    for field, values in spec["grid"].items():
+        if not isinstance(values, list) or not values:
+            raise UsageError(f"SPEC {path}: grid.{field}: give a list of at least one value")
+        if len({text(value) for value in values}) < len(values):
+            raise UsageError(f"SPEC {path}: grid.{field}: the same value twice")
+        if field in {**spec, **spec["fixed"]}:
+            raise UsageError(f"SPEC {path}: grid.{field}: also given outside of the grid; leave one out")
+
+
+def points(grid: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    """Every combination of the values, the last field's fastest."""
+    for values in itertools.product(*grid.values()):
+        yield dict(zip(grid, values, strict=True))
+
+
+def variants_of(path: Path, spec: Mapping[str, Any], out: Path) -> dict[str, tuple[Variant, dict[str, Any]]]:
+    """The variants by name, each with its point of the grid. Raises `UsageError` that names the spec."""
+    common = {key: spec[key] for key in ("env", "method") if key in spec} | spec["fixed"]
+    found = {}
+    for i, point in enumerate(points(spec["grid"])):
+        name = ",".join(f"{field}={text(value)}" for field, value in point.items()).replace("/", "_")
+        name = name if len(name) <= _LONGEST_NAME else f"variant_{i}"
+        try:
+            found[name] = make_variant(name, {**common, **point}, out), point
+        except (UsageError, ConfigError, DemonstrationsError) as error:
+            raise UsageError(f"SPEC {path}: {error}") from None
+    return found
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Trains what is missing, then writes sweep.csv and sweep.png; status 1 if a program failed."""
+    spec = read_spec(arguments.spec)
+    found = variants_of(arguments.spec, spec, arguments.out)
+    num_failed = study.carry_out([variant for variant, _ in found.values()], arguments, "sweep.json", spec)
+    rows = [
+        {**{field: text(value) for field, value in point.items()}, **comparison.row(variant)}
+        for variant, point in found.values()
+        if variant.finished
+    ]
+    if not rows:
+        raise UsageError(f"--out {arguments.out}: no variant was finished; see the worker.log of each program there")
+    table, figure = arguments.out / "sweep.csv", arguments.out / "sweep.png"
+    comparison.write_csv(table, rows)
+    from experiments import comparison_figures  # imports matplotlib
+
+    groups = {task: [row for row in rows if row["task"] == task] for task in dict.fromkeys(r["task"] for r in rows)}
+    title = "interquartile mean and 95 % interval over seeds, dots: seeds"
+    comparison_figures.draw_groups(figure, groups, "variant", title)
+    comparison.print_rows("IQM over seeds [95 % interval]", _COLUMNS, rows, section="task")
+    print(f"table   {table}\nfigure  {figure}")
+    return 1 if num_failed else 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

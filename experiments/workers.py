@@ -1,0 +1,158 @@
+"""Where programs are carried out: in processes on this machine, on a Ray cluster, or by SLURM.
+
+Each place runs `experiments.sweep_worker` on a program's folder, which all of them must see under the same path. A
+program whose worker dies is carried on once, from its last checkpoint.
+"""
+
+import concurrent.futures
+import importlib.util
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.command_line import UsageError
+
+LAUNCHERS = ("processes", "ray", "slurm")
+_PACKAGES = {"ray": "ray", "slurm": "submitit"}  # of the launchers, which are also names of extras
+_WRONG_INPUT = 2  # exit status; a second try would end in the same way
+_TRIES = 2
+
+Outcomes = Iterator[tuple[Path, str | None]]  # a program's folder and, if it failed, the last words of its worker
+
+
+def usable_cpus() -> list[int]:
+    """The CPUs that this process may run on."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def check_launcher(launcher: str) -> None:
+    """Raises `UsageError` where the launcher's package is not installed."""
+    package = _PACKAGES.get(launcher)
+    if package and importlib.util.find_spec(package) is None:
+        raise UsageError(f"--launcher {launcher}: {package} is not installed; pip install 'ccil_jax[{launcher}]'")
+
+
+def launch(
+    launcher: str, folders: Sequence[Path], num_workers: int, log_folder: Path, settings: Mapping[str, Any]
+) -> Outcomes:
+    """Carries out the programs in `folders`, `num_workers` at a time, and yields them as they end."""
+    if launcher == "ray":
+        return on_ray(folders, num_workers)
+    if launcher == "slurm":
+        return on_slurm(folders, num_workers, log_folder, settings)
+    return in_processes(folders, num_workers)
+
+
+def run_worker(folder: Path, cpus: Sequence[int] = (), stopping: threading.Event | None = None) -> str | None:
+    """Carries out the program in `folder` in a process of its own, and once more if that dies.
+
+    Returns the last words of a worker that failed for good. `stopping` ends it.
+    """
+    stopping = stopping or threading.Event()
+    command = [sys.executable, "-m", "experiments.sweep_worker", str(folder), "--until-eof"]
+    command += ["--cpus", ",".join(map(str, cpus))] if cpus else []
+    log, status = folder / "worker.log", 0
+    for _ in range(_TRIES):
+        with (
+            log.open("ab") as output,
+            subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,  # it ends with this process, whose end closes the pipe,
+                start_new_session=True,  # and not by a Ctrl-C, after which it would be tried again
+                stdout=output,
+                stderr=output,
+                env={**os.environ, "PYTHONPATH": _python_path()},
+            ) as process,
+        ):
+            while process.poll() is None:
+                if stopping.wait(0.2):
+                    process.terminate()
+                    process.wait()
+        status = process.returncode
+        if status in (0, _WRONG_INPUT) or stopping.is_set():
+            break
+    return None if status == 0 else f"exit status {status}: {_last_line(log)} ({log})"
+
+
+def in_processes(folders: Sequence[Path], num_workers: int) -> Outcomes:
+    """Worker processes on this machine; each gets its share of the CPUs."""
+    cpus = usable_cpus()
+    num_workers = max(1, min(num_workers, len(folders), len(cpus)))
+    shares: queue.SimpleQueue[list[int]] = queue.SimpleQueue()
+    for i in range(num_workers):
+        shares.put(cpus[i::num_workers])
+    stopping = threading.Event()
+
+    def carry_out(folder: Path) -> str | None:
+        share = shares.get()
+        try:
+            return run_worker(folder, share, stopping)
+        finally:
+            shares.put(share)
+
+    with concurrent.futures.ThreadPoolExecutor(num_workers) as pool:
+        futures = {pool.submit(carry_out, folder): folder for folder in folders}
+        try:
+            for future in concurrent.futures.as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            stopping.set()
+            for future in futures:
+                future.cancel()
+
+
+def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
+    """Tasks of a Ray cluster: the one that RAY_ADDRESS names, else one on this machine."""
+    import ray
+
+    ray.init(runtime_env={"env_vars": {"PYTHONPATH": _python_path()}}, log_to_driver=False)
+    try:
+        total = int(ray.cluster_resources().get("CPU", 1))
+        # Ray, too, starts a task once more whose process dies: the machine may be gone.
+        task = ray.remote(num_cpus=max(1, total // max(1, num_workers)), max_retries=_TRIES - 1)(run_worker)
+        waiting = {task.remote(folder): folder for folder in folders}
+        while waiting:
+            done, _ = ray.wait(list(waiting), num_returns=1)
+            try:
+                failure = ray.get(done[0])
+            except ray.exceptions.RayError as error:
+                failure = f"lost by Ray: {str(error).splitlines()[0]}"
+            yield waiting.pop(done[0]), failure
+    finally:
+        ray.shutdown()
+
+
+def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settings: Mapping[str, Any]) -> Outcomes:
+    """An array of SLURM jobs through submitit, which runs them on this machine where there is no SLURM.
+
+    `settings` are parameters of `submitit.AutoExecutor`, such as timeout_min or slurm_partition.
+    """
+    import submitit
+
+    executor = submitit.AutoExecutor(folder=log_folder)
+    executor.update_parameters(**{"name": "ccil_jax", "slurm_array_parallelism": num_workers, **settings})
+    jobs = executor.map_array(run_worker, folders)
+    for folder, job in zip(folders, jobs, strict=True):
+        failure: str | None = None
+        for attempt in range(_TRIES):
+            try:
+                failure = (job if attempt == 0 else executor.submit(run_worker, folder)).result()
+                break
+            except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError) as error:
+                failure = f"lost by SLURM: {str(error).splitlines()[0]}"
+        yield folder, failure
+
+
+def _python_path() -> str:
+    """A worker imports the packages that this process did."""
+    return os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else "no output"

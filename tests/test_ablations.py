@@ -1,0 +1,102 @@
+"""Ablations: every answer is a configuration that runs, few programs, and figures that are what they are called."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ccil_jax.config import Config, validate
+from experiments import ablations, comparison, comparison_figures, variants
+from experiments.ablations import QUESTIONS
+from experiments.comparison import Row, multiplier_path
+
+SHARED = {"env": "Swimmer"}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_every_answer_is_a_configuration(name: str) -> None:
+    configs = [Config(method=QUESTIONS[name].method, **changes) for changes in QUESTIONS[name].answers.values()]
+    for config in configs:
+        validate(config)
+    assert len(set(configs)) == len(configs) >= 2
+
+
+def test_the_first_answer_is_the_default(tmp_path: Path) -> None:
+    answers = ablations.ask(list(QUESTIONS), SHARED, tmp_path)
+    baselines = {answers[name, next(iter(question.answers))].name for name, question in QUESTIONS.items()}
+    assert baselines == {"malm", "cvag"}
+
+
+def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: Path) -> None:
+    answers = ablations.ask(list(QUESTIONS), SHARED, tmp_path)
+    different = {variant.name: variant for variant in answers.values()}
+    programs = variants.group(different.values(), tmp_path)
+    names = [{variant.name for variant in program.variants} for program in programs]
+    assert {"malm"} in names
+    assert {"cvag"} in names
+    assert {
+        *(f"malm,multiplier_learning_rate={rate}" for rate in (0.01, 0.2)),
+        *(f"malm,meta_learning_rate={rate}" for rate in (0.01, 0.2)),
+        *(f"malm,initial_multiplier={start}" for start in (1.0, 10.0)),
+    } in names
+    assert sum(map(len, names)) == len(different)
+    # As few as there are static configurations, and one more for the baseline's speed.
+    static = {variants.static_part(variant.plan.config) for variant in different.values()}
+    assert len(programs) == len(static) + 1
+
+
+def test_a_program_is_the_same_to_its_worker(tmp_path: Path) -> None:
+    shared = {**SHARED, "hidden_sizes": (8, 8), "num_demos": 3, "bootstrap_at_truncation": False}
+    chosen = ablations.ask(["windup"], shared, tmp_path).values()
+    for program in variants.group(chosen, tmp_path):
+        variants.write_program(program)
+        read = variants.read_program(program.folder)
+        for variant, again in zip(program.variants, read.variants, strict=True):
+            assert again.plan.config == variant.plan.config
+            assert again.plan.folder == variant.plan.folder
+            assert again.plan.config.hidden_sizes == (8, 8)
+            assert again.plan.demonstrations is not None
+            assert again.plan.demonstrations.num_episodes == 3
+
+
+def test_the_path_of_a_multiplier() -> None:
+    """By hand: two seeds, twenty iterations, so that the last two are the final ones."""
+    wound = np.array([0.0] * 4 + [4.0] * 4 + [2.0] * 10 + [1.0, 1.0])
+    steady = np.full(20, 0.5)
+    cost = np.array([30.0] * 6 + [20.0] * 14)
+    path = multiplier_path(np.stack([wound, steady], 1), np.stack([cost, cost], 1), limit=25.0)
+    assert path["max_multiplier"] == (4.0 + 0.5) / 2
+    assert path["final_multiplier"] == (1.0 + 0.5) / 2
+    assert path["windup"] == pytest.approx((2 + 10) / 20 / 2)  # below the limit from 6 on, above 1 up to 17
+
+
+def row(question: str, answer: str, level: float, rate: float | None, num_runs: int = 3) -> Row:
+    content: Row = {"question": question, "answer": answer, "task": "Swimmer", "num_seeds": 3}
+    content |= {"env_steps_per_second": rate, "runs_in_program": num_runs, "final_multiplier": 0.5}
+    for i, name in enumerate(comparison.SCORES):
+        values = [level, level + i, level + 2 * i]
+        content |= {name: level + i, f"{name}_low": level, f"{name}_high": level + 2 * i, f"{name}_per_seed": values}
+    return content
+
+
+@pytest.mark.parametrize(
+    ("rate", "num_runs", "expected"), [(50.0, 3, 0.5), (50.0, 6, None), (None, 3, None), (100.0, 3, 1.0)]
+)
+def test_speeds_compare_only_among_programs_of_one_size(rate: Any, num_runs: int, expected: Any) -> None:
+    baseline = row("gate", "batch", 1.0, 100.0)
+    assert ablations._relative_speed(row("gate", "episode", 1.0, rate, num_runs), baseline) == expected
+
+
+def test_table_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [row("gate", "batch", 90.0, 100.0), row("gate", "episode", 95.0, None), row("windup", "1.0", 80.0, 90.0)]
+    comparison.write_csv(tmp_path / "t.csv", rows)
+    lines = (tmp_path / "t.csv").read_text().splitlines()
+    assert lines[0].startswith("question,answer,task,num_seeds")
+    assert lines[2].startswith("gate,episode,Swimmer,3,,3,0.5,95,95,95,95 95 95,96,95,97,95 96 97")
+    columns = {"answer": "answer", "recovered_return": "recovered", "env_steps_per_second": "steps/s"}
+    comparison.print_rows("t", columns, rows, section="question")
+    printed = capsys.readouterr().out
+    assert "97.00 [95.00, 99.00]" in printed
+    comparison_figures.draw_groups(tmp_path / "t.png", {"a": rows[:2], "b": rows[2:]}, "answer", "t")
+    assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,129 @@
+"""Several configurations in one program: each run has its own numbers, and shares nothing with the others."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from ccil_jax import runner
+from ccil_jax.config import Config, ConfigError
+from ccil_jax.runner import Result
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+
+NUM_SEEDS = 2
+CHOICES = ((1.0, 0.02, 0.5), (2.0, 0.0, 0.25), (0.5, 0.1, 0.0))  # cost limit, step size and start of the multiplier
+
+
+def config(limit: float, rate: float, start: float, **changes: Any) -> Config:
+    return walk_config(
+        method="lgail",
+        multiplier_update="sgd",
+        cost_limit=limit,
+        multiplier_learning_rate=rate,
+        initial_multiplier=start,
+        **changes,
+    )
+
+
+def train(*choices: tuple[float, float, float], **settings: Any) -> list[Result]:
+    configs = [config(*choice) for choice in choices]
+    with quick_compilation():
+        return runner.train_runs(configs, Walk(), walk_demonstrations(), num_seeds=NUM_SEEDS, seed=3, **settings)
+
+
+@pytest.fixture(scope="module")
+def results() -> list[Result]:
+    return train(*CHOICES)
+
+
+def test_every_run_has_its_own_numbers(results: list[Result]) -> None:
+    """The multiplier recomputed from the logged costs: lambda + rate (J - limit), not below 0."""
+    for result, (limit, rate, start) in zip(results, CHOICES, strict=True):
+        assert result.config == config(limit, rate, start)
+        assert result.metrics["multiplier"].shape == (20, NUM_SEEDS)
+        expected = np.full(NUM_SEEDS, start)
+        for cost, multiplier in zip(result.metrics["episode_cost"], result.metrics["multiplier"], strict=True):
+            expected = np.clip(expected + rate * (cost - limit), 0.0, 100.0)
+            np.testing.assert_allclose(multiplier, expected, atol=1e-5)
+    assert len({float(r.metrics["multiplier"][-1, 0]) for r in results}) == len(CHOICES)
+
+
+def test_the_order_of_the_configurations_does_not_matter(results: list[Result]) -> None:
+    for result, same in zip(results, reversed(train(*reversed(CHOICES))), strict=True):
+        assert same_bits((result.state, result.metrics), (same.state, same.metrics))
+
+
+def test_a_run_begins_as_it_would_alone(results: list[Result]) -> None:
+    """The same seeds; later, programs of other widths round differently."""
+    alone = train(CHOICES[0])[0]
+    for name, rows in alone.metrics.items():
+        np.testing.assert_allclose(results[0].metrics[name][0], rows[0], rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+def test_stopped_and_resumed_together(results: list[Result], tmp_path: Path) -> None:
+    train(*CHOICES, checkpoint_dir=tmp_path / "together", stop_after=10)
+    resumed = train(*CHOICES, checkpoint_dir=tmp_path / "together", resume=True)
+    for i, (result, same) in enumerate(zip(results, resumed, strict=True)):
+        assert same_bits((result.state, result.metrics), (same.state, same.metrics))
+        runner.save(result, tmp_path / str(i))
+        loaded = runner.load(result.config, Walk(), tmp_path / str(i), NUM_SEEDS)
+        assert same_bits(loaded.agent, result.agent)
+
+
+def test_only_traced_fields_may_differ() -> None:
+    with pytest.raises(ConfigError, match="hidden_sizes"):
+        runner.train_runs([walk_config(method="trpo"), walk_config(method="trpo", hidden_sizes=(5,))], Walk())
+
+
+def test_fields_that_agree_stay_numbers() -> None:
+    shared, varied = runner.join([config(1.0, 0.1, 0.0), config(1.0, 0.2, 0.0)], num_seeds=2)
+    assert shared.cost_limit == 1.0
+    assert list(varied) == ["multiplier_learning_rate"]
+    np.testing.assert_array_equal(varied["multiplier_learning_rate"], np.float32([0.1, 0.1, 0.2, 0.2]))
+    assert runner.join([config(1.0, 0.1, 0.0)] * 2, num_seeds=2)[1] == {}
+    assert isinstance(varied["multiplier_learning_rate"], jax.Array)
+
+
+ON_FOUR_DEVICES = """
+import json, jax
+from ccil_jax import runner
+from ccil_jax.program import compile_program
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+
+env, demonstrations = Walk(), walk_demonstrations()
+expert, keys = runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 2)
+rates = (0.05, 0.01, 0.2)
+configs = [
+    runner.resolve(walk_config(method="malm", multiplier_learning_rate=rate), env, demonstrations) for rate in rates
+]
+shared, varied = runner.join(configs, num_seeds=2)
+alone = compile_program(configs[0], env, expert, 2, one_by_one=True)
+together = compile_program(shared, env, expert, 6, varied=varied, one_by_one=True)
+with quick_compilation():
+    side_by_side = compile_program(shared, env, expert, 4, varied={k: v[:4] for k, v in varied.items()})
+expected, found = alone.chunk(alone.init(keys)), together.chunk(together.init(jax.numpy.tile(keys, 3)))
+print(json.dumps({
+    "devices": [len(program.state.key.sharding.device_set) for program in (alone, together, side_by_side)],
+    "same": [same_bits(expected, jax.tree.map(lambda leaf: leaf[i : i + 2], found)) for i in (0, 2, 4)],
+    "collectives": [
+        f"{name} of {i}" for name in ("all-reduce", "all-gather", "collective-permute", "all-to-all", "reduce-scatter")
+        for i, program in enumerate((alone, together, side_by_side)) if name in program.text()
+    ],
+}))
+"""
+
+
+def test_devices_share_runs_without_a_word() -> None:
+    """Four CPU devices: nothing travels between them; taken in turn, a run has the same bits in any company."""
+    environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "PJRT_NPROC": "16"}
+    environment["PYTHONPATH"] = str(Path(__file__).parent.parent)
+    command = [sys.executable, "-c", ON_FOUR_DEVICES]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {"devices": [2, 3, 4], "same": [True, False, False], "collectives": []}
