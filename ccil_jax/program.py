@@ -120,5 +120,5 @@ def compile_program(
         state=state,
         chunk_length=chunk_length,
         compile_seconds=time.perf_counter() - start,
-        text=compiled_chunk.as_text,
+        text=lambda: compiled_chunk.as_text() or "",
     )

@@ -61,7 +61,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows({name: _cell(value) for name, value in content.items()} for content in rows)
 
 
-def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], section: str | None = None) -> None:
+def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], section: str = "") -> None:
     """The rows as a terminal table with these columns (name: heading); a rule where the value of `section` changes."""
     from rich.table import Table
 

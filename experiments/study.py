@@ -1,6 +1,7 @@
 """What `sweep` and `ablations` share: carrying out variants in few programs, and finding them again."""
 
 import argparse
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 from experiments import command_line, run_folder, variants, workers
 from experiments.command_line import Parser, UsageError
 from experiments.variants import Program, Variant
+
+_INTERRUPTED = 130  # exit status after Ctrl-C, as of shells
 
 
 def add_options(parser: Parser) -> None:
@@ -28,7 +31,7 @@ def add_options(parser: Parser) -> None:
         type=_setting,
         default=[],
         metavar="NAME=VALUE",
-        help="parameters of submitit's executor, such as timeout_min=600 slurm_partition=cpu",
+        help="parameters of submitit's executor, such as cpus_per_task=8 timeout_min=600 slurm_partition=cpu",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for runs, table and figure")
     parser.add_argument("--resume", action="store_true", help="finish what is missing in --out")
@@ -87,9 +90,13 @@ def _wait(programs: Sequence[Program], arguments: argparse.Namespace) -> int:
     outcomes = workers.launch(
         arguments.launcher, list(by_folder), arguments.workers, arguments.out / "slurm", dict(arguments.slurm)
     )
-    for i, (folder, failure) in enumerate(outcomes, 1):
-        names = " ".join(variant.name for variant in by_folder[folder].variants)
-        state = "done" if failure is None else f"FAILED ({failure})"
-        print(f"[{i}/{len(programs)}] {time.monotonic() - start:,.0f} s: {names}: {state}", flush=True)
-        num_failed += failure is not None
+    try:
+        for i, (folder, failure) in enumerate(outcomes, 1):
+            names = " ".join(variant.name for variant in by_folder[folder].variants)
+            state = "done" if failure is None else f"FAILED ({failure})"
+            print(f"[{i}/{len(programs)}] {time.monotonic() - start:,.0f} s: {names}: {state}", flush=True)
+            num_failed += failure is not None
+    except KeyboardInterrupt:
+        print("stopped; continue with --resume", file=sys.stderr)
+        raise SystemExit(_INTERRUPTED) from None
     return num_failed

@@ -81,7 +81,7 @@ def check_unchanged(variant: Variant) -> None:
     chosen |= {name: getattr(plan, name) for name in ("eval_episodes", "env_options", "one_by_one")}
     saved = {**run.facts, **dataclasses.asdict(run.config)}
     for name, value in chosen.items():
-        if saved[name] != value:
+        if saved.get(name, value) != value:  # an older version may not say
             raise UsageError(f"--resume: {plan.folder} has {name} {saved[name]}, not {value}; choose another --out")
     demos = run.facts["demonstrations"]
     if demos and plan.demonstrations_path and run_folder.sha256(plan.demonstrations_path) != demos["sha256"]:

@@ -21,6 +21,7 @@ LAUNCHERS = ("processes", "ray", "slurm")
 _PACKAGES = {"ray": "ray", "slurm": "submitit"}  # of the launchers, which are also names of extras
 _WRONG_INPUT = 2  # exit status; a second try would end in the same way
 _TRIES = 2
+_LONGEST_JOB_MINUTES = 24 * 60  # submitit's own default is five
 
 Outcomes = Iterator[tuple[Path, str | None]]  # a program's folder and, if it failed, the last words of its worker
 
@@ -112,9 +113,10 @@ def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
 
     ray.init(runtime_env={"env_vars": {"PYTHONPATH": _python_path()}}, log_to_driver=False)
     try:
-        total = int(ray.cluster_resources().get("CPU", 1))
+        cpus = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
+        share = max(1, min(max(cpus), sum(cpus) // num_workers))  # a task that no node can hold would wait for ever
         # Ray, too, starts a task once more whose process dies: the machine may be gone.
-        task = ray.remote(num_cpus=max(1, total // max(1, num_workers)), max_retries=_TRIES - 1)(run_worker)
+        task = ray.remote(num_cpus=share, max_retries=_TRIES - 1)(run_worker)
         waiting = {task.remote(folder): folder for folder in folders}
         while waiting:
             done, _ = ray.wait(list(waiting), num_returns=1)
@@ -135,7 +137,8 @@ def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settin
     import submitit
 
     executor = submitit.AutoExecutor(folder=log_folder)
-    executor.update_parameters(**{"name": "ccil_jax", "slurm_array_parallelism": num_workers, **settings})
+    defaults = {"name": "ccil_jax", "timeout_min": _LONGEST_JOB_MINUTES, "slurm_array_parallelism": num_workers}
+    executor.update_parameters(**{**defaults, **settings})
     jobs = executor.map_array(run_worker, folders)
     for folder, job in zip(folders, jobs, strict=True):
         failure: str | None = None

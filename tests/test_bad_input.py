@@ -141,6 +141,10 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "benchmark of what": (("benchmark", "--tasks", "Swimer"), "--tasks Swimer: unknown task; did you mean Swimmer?"),
     "benchmark not divisible": (("benchmark", "--num-envs", "17"), "--num-envs 17"),
     "benchmark to nowhere": (("benchmark", "--out", "good.npz/b.json"), "--out good.npz: cannot be written"),
+    "sweep of what": (("sweep", "none.toml", "--out", "run"), "SPEC none.toml: cannot be read (No such file"),
+    "ablations of what": (("ablations", "--out", "run"), "--env: required"),
+    "ablations ask what": (("ablations", "--env", "Swimmer", "--out", "run", "--questions", "gat"), "invalid choice"),
+    "ablations into a run": (("ablations", "--env", "Swimmer", "--out", "full"), "--out full: not empty"),
     "expert of what": (("expert", "--out", "expert.npz"), "--env: required"),
 }
 
@@ -179,7 +183,7 @@ def test_bad_options(folder: Path, case: str) -> None:
     assert_one_line(launch(*arguments, cwd=folder), arguments[0], message)
 
 
-@pytest.mark.parametrize("launcher", ["train", "expert", "evaluate", "report", "benchmark"])
+@pytest.mark.parametrize("launcher", ["train", "expert", "evaluate", "report", "benchmark", "ablations"])
 def test_help_needs_no_jax(folder: Path, launcher: str) -> None:
     done = launch(launcher, "--help", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
