@@ -52,7 +52,11 @@ def _read_legacy(path: Path) -> Arrays:
             raise ArchiveError(
                 f"{path}: '{key}' has {len(parts)} trajectories, 'obs' has {len(found['obs'])}; they must be equal"
             )
-    lengths = [len(part) if part.ndim else 0 for part in found["obs"]]
+    for key in legacy_npz.KEYS:
+        for i, part in enumerate(found[key]):
+            if part.ndim == 0:
+                raise ArchiveError(f"{path}: '{key}' has shape () (trajectory {i}), must have one row a step")
+    lengths = [len(part) for part in found["obs"]]
     rewards = _columns(found["rews"], lengths, "rews", path) if "rews" in found else None
     return {
         "obs": _join([_rows(part) for part in found["obs"]], "obs", path),
@@ -89,7 +93,9 @@ def _read_hdf5(path: Path) -> Arrays:
     for key in ("observations", "actions", "terminals", "timeouts"):
         if key not in found:
             raise ArchiveError(f"{path}: key '{key}' is missing; DSRL and Minari files can be read")
-    num_rows = len(found["observations"]) if found["observations"].ndim else 0
+    if found["observations"].ndim == 0:
+        raise ArchiveError(f"{path}: 'observations' has shape (), must have one row a step")
+    num_rows = len(found["observations"])
     for key, array in found.items():
         if array.ndim == 0 or len(array) != num_rows:
             raise ArchiveError(f"{path}: '{key}' has shape {array.shape}, must have {num_rows} rows as 'observations'")
@@ -183,7 +189,7 @@ def _flags_at_ends(lengths: Sequence[int]) -> Arrays:
 
 def _rows(part: np.ndarray) -> np.ndarray:
     """[T, ...] as [T, columns]; a vector is one column."""
-    return part.reshape(len(part), -1) if part.ndim and len(part) else part
+    return part.reshape(len(part), -1) if len(part) else part
 
 
 def _columns(parts: Sequence[np.ndarray], lengths: Sequence[int], key: str, path: Path) -> list[np.ndarray]:

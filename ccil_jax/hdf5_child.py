@@ -1,4 +1,4 @@
-"""The process that reads one HDF5 file and writes what it holds as `.npz`: `python -m ccil_jax.hdf5_child FILE OUT MAX`.
+"""The process that reads one HDF5 file (argument 1) and writes what it holds as `.npz` (argument 2).
 
 The HDF5 library is C and meets damaged files with crashes, endless loops and huge allocations; here they end a process
 that has nothing to lose. Links, external storage and virtual datasets, which make one file read another, are refused.
@@ -22,12 +22,12 @@ _NAME = re.compile(
 _FILTERS = {1, 2, 3, 32000}  # deflate, shuffle, Fletcher's checksum, LZF: what h5py brings along
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """One line: the entry and what is wrong with it."""
 
 
 def extract(path: Path, out: Path, max_bytes: int) -> None:
-    """Writes the known datasets of `path` to the archive `out`, `max_bytes` of them at most. Raises `Refused`."""
+    """Writes the known datasets of `path` to the archive `out`, `max_bytes` of them at most. Raises `RefusedError`."""
     import h5py
 
     with h5py.File(path, "r", locking=False) as file:
@@ -37,7 +37,7 @@ def extract(path: Path, out: Path, max_bytes: int) -> None:
             _check(name, dataset, max_bytes)
             total += dataset.size * dataset.dtype.itemsize
         if total > max_bytes:
-            raise Refused(f"holds {total} bytes, limit {max_bytes}; use fewer episodes")
+            raise RefusedError(f"holds {total} bytes, limit {max_bytes}; use fewer episodes")
         np.savez(out, allow_pickle=False, **{name: dataset[()] for name, dataset in datasets.items()})
 
 
@@ -53,7 +53,7 @@ def _datasets(file: Any) -> Iterator[tuple[str, Any]]:
             _check_link(group, name, full)
             entry = group[name]
             if not isinstance(entry, h5py.Dataset):
-                raise Refused(f"'{full}' is not an array; only plain arrays can be used")
+                raise RefusedError(f"'{full}' is not an array; only plain arrays can be used")
             yield full, entry
 
 
@@ -63,13 +63,13 @@ def _groups(file: Any) -> Iterator[Any]:
 
     yield file
     if len(file) > MAX_ENTRIES:
-        raise Refused(f"holds {len(file)} entries, limit {MAX_ENTRIES}")
+        raise RefusedError(f"holds {len(file)} entries, limit {MAX_ENTRIES}")
     for name in file:
         if re.fullmatch(r"episode_\d{1,9}", name):
             _check_link(file, name, name)
             episode = file[name]
             if not isinstance(episode, h5py.Group):
-                raise Refused(f"'{name}' is not a group; an episode holds several arrays")
+                raise RefusedError(f"'{name}' is not a group; an episode holds several arrays")
             yield episode
             if "infos" in episode:
                 _check_link(episode, "infos", f"{name}/infos")
@@ -81,23 +81,25 @@ def _check_link(group: Any, name: str, full: str) -> None:
     import h5py
 
     if not isinstance(group.get(name, getlink=True), h5py.HardLink):
-        raise Refused(f"'{full}' is a link, refused because it can lead to another file; copy the data in")
+        raise RefusedError(f"'{full}' is a link, refused because it can lead to another file; copy the data in")
 
 
 def _check(name: str, dataset: Any, max_bytes: int) -> None:
     """Everything that can be known of a dataset without reading its data."""
     layout = dataset.id.get_create_plist()
     if dataset.is_virtual or layout.get_external_count():
-        raise Refused(f"'{name}' is kept in other files, refused; copy the data in")
+        raise RefusedError(f"'{name}' is kept in other files, refused; copy the data in")
     if dataset.shape is None or dataset.dtype.kind not in "biuf" or dataset.dtype.itemsize > 16:
-        raise Refused(f"'{name}' has dtype {str(dataset.dtype)[:60]}, must be a number; convert it and save again")
+        raise RefusedError(f"'{name}' has dtype {str(dataset.dtype)[:60]}, must be a number; convert it and save again")
     filters = {layout.get_filter(i)[0] for i in range(layout.get_nfilters())}
     if not filters <= _FILTERS:
-        raise Refused(f"'{name}' has filter {min(filters - _FILTERS)}, only gzip and lzf are read; save it with those")
+        raise RefusedError(
+            f"'{name}' has filter {min(filters - _FILTERS)}, only gzip and lzf are read; save it with those"
+        )
     if dataset.dtype.itemsize * max(dataset.size, _size(dataset.chunks or ())) > max_bytes:
-        raise Refused(f"'{name}' declares shape {dataset.shape}, more than the limit of {max_bytes} bytes")
+        raise RefusedError(f"'{name}' declares shape {dataset.shape}, more than the limit of {max_bytes} bytes")
     if dataset.size and not dataset.id.get_storage_size():
-        raise Refused(f"'{name}' declares shape {dataset.shape} and holds no data; record it again")
+        raise RefusedError(f"'{name}' declares shape {dataset.shape} and holds no data; record it again")
 
 
 def _size(shape: Sequence[int]) -> int:
@@ -127,7 +129,7 @@ def main(arguments: Sequence[str]) -> int:
     limit_resources(max_bytes)
     try:
         extract(path, out, max_bytes)
-    except Refused as error:
+    except RefusedError as error:
         print(error, file=sys.stderr)
         return REFUSED
     except MemoryError:

@@ -42,7 +42,7 @@ _DAMAGE = (
 )
 
 
-class _Unsafe(Exception):
+class _UnsafeError(Exception):
     """A pickle asks for more than arrays."""
 
 
@@ -77,7 +77,7 @@ def unpickle(content: bytes, shape: tuple[int, ...], where: str) -> np.ndarray:
         if len(shape) == 1 and any(isinstance(value, _Array | list | tuple) for value in array.values):
             return budget.ragged(array.values)
         return budget.numbers(array.values).reshape(shape)
-    except _Unsafe as error:
+    except _UnsafeError as error:
         raise npz.ArchiveError(f"{where} {error}, refused because it could execute code; record it anew") from None
     except _DAMAGE:
         raise npz.ArchiveError(f"{where} is truncated or damaged, or no array of arrays; record it anew") from None
@@ -86,14 +86,15 @@ def unpickle(content: bytes, shape: tuple[int, ...], where: str) -> np.ndarray:
 def _check_opcodes(content: bytes) -> None:
     """Reads the program without running it: known opcodes, sizes that the file holds, a memo without gaps."""
     count = 0
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):  # noqa: B007
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
         if opcode.name not in _OPCODES:
-            raise _Unsafe(f"holds a pickle with opcode {opcode.name}")
+            raise _UnsafeError(f"holds a pickle with opcode {opcode.name}")
         if count > MAX_OPCODES:
             raise ValueError("too many opcodes")
-        if opcode.name in ("BINPUT", "LONG_BINPUT") and argument > count:
+        size = argument if isinstance(argument, int) else 0
+        if opcode.name in ("BINPUT", "LONG_BINPUT") and size > count:
             raise ValueError("the unpickler would make a memo of this size")
-        if opcode.name == "FRAME" and argument > len(content):
+        if opcode.name == "FRAME" and size > len(content):
             raise ValueError("the frame is larger than the file")
 
 
@@ -186,7 +187,7 @@ class _Unpickler(pickle.Unpickler):
             ("_codecs", "encode"): self._encode,
         }
         if (module, name) not in names:
-            raise _Unsafe(f"holds a pickle that names {ascii(f'{module}.{name}'[:80])}")
+            raise _UnsafeError(f"holds a pickle that names {f'{module}.{name}'[:80]!a}")
         return names[module, name]
 
     def _encode(self, text: str, encoding: str) -> bytes:  # how Python 3 writes bytes that Python 2 can read

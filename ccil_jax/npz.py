@@ -159,6 +159,8 @@ def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
 
 def _read_header(content: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     version = np.lib.format.read_magic(content)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError("not a version of the format")
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     with warnings.catch_warnings():  # about headers written by Python 2, and about odd literals in damaged ones
         warnings.simplefilter("ignore")

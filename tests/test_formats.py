@@ -133,15 +133,15 @@ def test_episodes_of_equal_length_are_plain_arrays(tmp_path: Path) -> None:
 
 def test_a_pickle_of_python_2(tmp_path: Path) -> None:
     """As protocol 2 of Python 2 wrote an object array of one float64 vector [2.5, -1]: text and bytes are one type."""
-    text = lambda s: b"U" + bytes([len(s)]) + s  # noqa: E731
+
+    def text(value: bytes) -> bytes:
+        return b"U" + bytes([len(value)]) + value
+
+    def dtype(code: bytes, order: bytes) -> bytes:
+        state = b"(K\x03" + text(order) + b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
+        return b"cnumpy\ndtype\n" + text(code) + b"K\x00K\x01\x87R" + state
+
     new = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
-    dtype = lambda code, order: (
-        b"cnumpy\ndtype\n"
-        + text(code)
-        + b"K\x00K\x01\x87R(K\x03"
-        + text(order)
-        + b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
-    )  # noqa: E731, E501
     inner = new + b"(K\x01K\x02\x85" + dtype(b"f8", b"<") + b"\x89" + text(np.array([2.5, -1.0]).tobytes()) + b"tb"
     content = b"\x80\x02" + new + b"(K\x01K\x01\x85" + dtype(b"O8", b"|") + b"\x89](" + inner + b"etb."
     from ccil_jax import legacy_npz
