@@ -2,7 +2,8 @@
 
 A file is an `.npz` archive without pickled objects: `obs [n, obs_dim]`, `actions [n, action_dim]`, `rewards [n]`
 (optional), `costs [n]`, `terminated [n]`, `truncated [n]`, `episode_ends [E]` and `metadata`, a JSON object as text.
-Files come from strangers, so nothing in them is trusted: see `load_demonstrations`.
+Other formats are read too: `ccil_jax.formats`. Files come from strangers, so nothing in them is trusted: see
+`load_demonstrations`.
 """
 
 import dataclasses
@@ -14,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ccil_jax import npz
+from ccil_jax import formats, npz
 
 _RANKS = {"obs": 2, "actions": 2, "rewards": 1, "costs": 1, "terminated": 1, "truncated": 1, "episode_ends": 1}
 _STEP_KEYS = ("obs", "actions", "rewards", "costs", "terminated", "truncated")
@@ -108,19 +109,32 @@ class Demonstrations:
         return np.add.reduceat(values.astype(np.float64), starts)
 
 
-def load_demonstrations(path: str | os.PathLike[str]) -> Demonstrations:
-    """Reads and checks a demonstrations file. Runs no code from it and unpacks at most `npz.MAX_BYTES`.
+def load_demonstrations(path: str | os.PathLike[str], *, default_cost: float | None = None) -> Demonstrations:
+    """Reads and checks demonstrations, ours or those of `ccil_jax.formats`, recognised by content.
+
+    Runs no code from the file and unpacks at most `npz.MAX_BYTES`. `default_cost` is taken for every step where a
+    file of another format has no costs; without it such a file is refused.
 
     Raises `DemonstrationsError`, one line with file, key and remedy, for anything that is not a sound file.
     """
     path = Path(path)
-    arrays: dict[str, Any] = {"rewards": None}
     try:
-        arrays.update(npz.read(path, (*_RANKS, "metadata"), optional=frozenset({"rewards"}), remedy=_REWRITE))
+        read = formats.reader_of(path)
+        arrays = _read_own(path) if read is None else read(path)
     except npz.ArchiveError as error:
         raise DemonstrationsError(str(error)) from None
-    arrays["metadata"] = _parse_metadata(arrays["metadata"], path)
+    if arrays["costs"] is None:
+        if default_cost is None:
+            raise DemonstrationsError(f"{path}: {formats.NO_COSTS}")
+        arrays["costs"] = np.full(len(arrays["obs"]), default_cost, np.float32)
     return _checked(arrays, str(path))
+
+
+def _read_own(path: Path) -> dict[str, Any]:
+    arrays: dict[str, Any] = {"rewards": None}
+    arrays.update(npz.read(path, (*_RANKS, "metadata"), optional=frozenset({"rewards"}), remedy=_REWRITE))
+    arrays["metadata"] = _parse_metadata(arrays["metadata"], path)
+    return arrays
 
 
 def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrations) -> None:
@@ -157,6 +171,8 @@ def check_matches(demonstrations: Demonstrations, path: str | os.PathLike[str], 
 
 def _parse_metadata(array: np.ndarray, path: Path) -> dict[str, Any]:
     try:
+        if array.nbytes > formats.MAX_METADATA_BYTES or (array.dtype != np.uint8 and array.ndim):
+            raise ValueError("not a text of reasonable length")
         text = array.tobytes().decode() if array.dtype == np.uint8 else str(array.astype(np.str_)[()])
         metadata = json.loads(text)
     except (ValueError, RecursionError):

@@ -10,15 +10,19 @@ import os
 import struct
 import tempfile
 import tokenize
+import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 MAX_BYTES = 2 * 1024**3  # of all arrays together, unpacked: a small archive can unpack to terabytes
+
+_CHUNK = 1024**2
+ObjectReader = Callable[[bytes, tuple[int, ...], str], np.ndarray]  # pickle, declared shape, "file: 'key'" -> array
 
 _DAMAGE = (  # what a hostile archive can raise out of zipfile, zlib, struct, ast and NumPy
     ArithmeticError,
@@ -43,11 +47,17 @@ class ArchiveError(ValueError):
 
 
 def read(
-    path: Path, keys: Iterable[str], *, optional: frozenset[str] = frozenset(), remedy: str
+    path: Path,
+    keys: Iterable[str],
+    *,
+    optional: frozenset[str] = frozenset(),
+    remedy: str,
+    read_objects: ObjectReader | None = None,
 ) -> dict[str, np.ndarray]:
     """The arrays named `keys`, optional ones only where present. Runs no code and unpacks at most `MAX_BYTES`.
 
-    Raises `ArchiveError`; `remedy` ends the messages about archives of a wrong kind.
+    Object arrays are refused unless `read_objects` reads their pickles. Raises `ArchiveError`; `remedy` ends the
+    messages about archives of a wrong kind.
     """
     _check_kind(path, remedy)
     arrays: dict[str, np.ndarray] = {}
@@ -60,7 +70,7 @@ def read(
             for key in keys:
                 info = members.get(f"{key}.npy")
                 if info is not None:
-                    arrays[key] = _read_array(archive, info, f"{path}: '{key}'", remedy)
+                    arrays[key] = _read_array(archive, info, f"{path}: '{key}'", remedy, read_objects)
                 elif key not in optional:
                     raise ArchiveError(f"{path}: key '{key}' is missing; {remedy}")
     except ArchiveError:
@@ -70,6 +80,15 @@ def read(
     except _DAMAGE:
         raise ArchiveError(f"{path}: truncated or damaged .npz archive; copy or record it again") from None
     return arrays
+
+
+def keys_of(path: Path) -> frozenset[str]:
+    """Names of the arrays in an archive; none for what is no archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return frozenset(name.removesuffix(".npy") for name in archive.namelist())
+    except _DAMAGE:
+        return frozenset()
 
 
 def write(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -92,7 +111,7 @@ def _check_kind(path: Path, remedy: str) -> None:
     if not path.exists():
         raise ArchiveError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise ArchiveError(f"{path}: not a file; give the .npz file itself")
+        raise ArchiveError(f"{path}: not a file, and no Minari dataset (data/main_data.hdf5); give the file itself")
     try:
         with path.open("rb") as file:
             start = file.read(2)
@@ -102,25 +121,50 @@ def _check_kind(path: Path, remedy: str) -> None:
         raise ArchiveError(f"{path}: the file is empty (0 bytes); copy or record it again")
     if start[:1] == b"\x80":
         raise ArchiveError(f"{path}: a pickle, refused because it could execute code; {remedy}")
+    if path.stat().st_size > MAX_BYTES:
+        raise ArchiveError(f"{path}: larger than the limit of {MAX_BYTES} bytes; use fewer episodes")
     if start != b"PK":
         raise ArchiveError(f"{path}: not an .npz archive; {remedy}")
 
 
-def _read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str, remedy: str) -> np.ndarray:
+def _read_array(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str, remedy: str, read_objects: ObjectReader | None
+) -> np.ndarray:
     """One member as an array, once its header has been found to agree with its size."""
     try:
-        content = io.BytesIO(archive.read(info))
-        version = np.lib.format.read_magic(content)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran_order, dtype = read_header(content)
+        content = io.BytesIO(_unpack(archive, info))
+        shape, fortran_order, dtype = _read_header(content)
         if not dtype.hasobject and len(content.getbuffer()) - content.tell() == _num_bytes(shape, dtype):
             order: Any = "F" if fortran_order else "C"
             return np.ndarray(shape, dtype, buffer=content.getbuffer(), offset=content.tell(), order=order)
     except _DAMAGE:
         raise ArchiveError(f"{where} is truncated or damaged; copy or record the file again") from None
+    if dtype == np.dtype(object) and read_objects is not None:
+        return read_objects(content.read(), shape, where)
     if dtype.hasobject:
         raise ArchiveError(f"{where} holds pickled objects, refused because they could execute code; {remedy}")
     raise ArchiveError(f"{where} declares shape {shape}, which is not what the file holds; record it again")
+
+
+def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
+    """The member's bytes, never more than it declares: `ZipFile.read` unpacks all there is before it looks."""
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError("NumPy writes no other compression")  # and LZMA's header chooses how much memory it takes
+    with archive.open(info) as member:
+        parts = []
+        while part := member.read(min(_CHUNK, info.file_size + 1)):
+            parts.append(part)
+    return b"".join(parts)
+
+
+def _read_header(content: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(content)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError("not a version of the format")
+    read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    with warnings.catch_warnings():  # about headers written by Python 2, and about odd literals in damaged ones
+        warnings.simplefilter("ignore")
+        return read_header(content)
 
 
 def _num_bytes(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:

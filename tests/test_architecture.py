@@ -23,6 +23,10 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOU
 # A file of the learner imports only from those before it. A new file needs a place here.
 ORDER = (
     "npz",
+    "legacy_npz",
+    "hdf5_child",
+    "hdf5",
+    "formats",
     "config",
     "types",
     "distributions",
@@ -136,7 +140,8 @@ def test_the_order_names_existing_files() -> None:
 
 @pytest.mark.parametrize("name", SOURCES)
 def test_no_file_can_make_us_run_its_code(name: str) -> None:
-    assert [m for m in imports(TREES[name]) if m.partition(".")[0] in FORBIDDEN_MODULES] == []
+    allowed = {"pickle"} if name == "ccil_jax.legacy_npz" else set()  # the restricted reader: see the next test
+    assert [m for m in imports(TREES[name]) if m.partition(".")[0] in FORBIDDEN_MODULES - allowed] == []
     for function, call in calls(TREES[name]):
         where = f"{name}, line {call.lineno}: {function}"
         assert function not in FORBIDDEN_CALLS, where
@@ -144,6 +149,17 @@ def test_no_file_can_make_us_run_its_code(name: str) -> None:
             if keyword.arg == "allow_pickle":
                 assert isinstance(keyword.value, ast.Constant), where
                 assert keyword.value.value is False, where
+
+
+def test_the_restricted_reader_takes_only_the_class_from_pickle() -> None:
+    tree = TREES["ccil_jax.legacy_npz"]
+    used = {
+        ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Attribute) and ast.unparse(n).startswith("pickle.")
+    }
+    assert used == {"pickle.Unpickler", "pickle.UnpicklingError"}
+    assert [m for m in imports(tree) if m.startswith("pickle.")] == []
+    assert any(isinstance(n, ast.FunctionDef) and n.name == "find_class" for n in ast.walk(tree))
+    assert "super().find_class" not in ast.unparse(tree)
 
 
 def at_import(tree: ast.Module) -> Iterator[ast.AST]:

@@ -1,0 +1,53 @@
+"""HDF5 files from strangers, read by a child process: see `ccil_jax.hdf5_child` for what is refused and why."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ccil_jax import hdf5_child, npz
+
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
+TIMEOUT = 300.0  # seconds
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays that demonstrations are made of, by their path inside the file.
+
+    Raises `ArchiveError`, also where the HDF5 library crashed, hung or took too much memory.
+    """
+    if importlib.util.find_spec("h5py") is None:
+        raise npz.ArchiveError(f"{path}: reading HDF5 needs h5py; install it with `pip install 'ccil_jax[hdf5]'`")
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "arrays.npz"
+        try:
+            status, complaint = run_child([str(path.absolute()), str(out), str(npz.MAX_BYTES)])
+        except subprocess.TimeoutExpired:
+            raise npz.ArchiveError(f"{path}: not read within {TIMEOUT:g} s; the HDF5 file is damaged") from None
+        if status == hdf5_child.REFUSED:
+            raise npz.ArchiveError(f"{path}: {complaint}")
+        if status != 0:
+            raise npz.ArchiveError(f"{path}: damaged HDF5 file, its reader ended with status {status}; copy it again")
+        return npz.read(out, sorted(npz.keys_of(out)), remedy="copy the file again")
+
+
+def run_child(arguments: Sequence[str]) -> tuple[int, str]:
+    """Exit status and last words of `hdf5_child` in a fresh process. Raises `subprocess.TimeoutExpired`."""
+    root = str(Path(__file__).parent.parent)
+    settings = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
+        "HDF5_PLUGIN_PRELOAD": "::",  # no filter is loaded from disk, whatever the file asks for
+        "OPENBLAS_NUM_THREADS": "1",  # its threads would count against the child's memory
+    }
+    command = [sys.executable, "-P", "-m", "ccil_jax.hdf5_child", *arguments]
+    done = subprocess.run(
+        command, env=settings, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace",
+        timeout=TIMEOUT, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stderr.strip().rpartition("\n")[2]

@@ -1,0 +1,66 @@
+"""Turns demonstrations of another format into ours: baselines and CCIL `.npz`, DSRL's HDF5, a Minari folder.
+
+The format is recognised by content. The file is read as one from a stranger: no code in it runs, and what is damaged,
+inconsistent or of another task ends in one line.
+"""
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ccil_jax.demonstrations import Demonstrations, check_matches, load_demonstrations, save_demonstrations
+from experiments import command_line, options
+from experiments.command_line import Parser, UsageError
+
+
+def make_parser() -> Parser:
+    """The options of this launcher."""
+    parser = Parser("convert", __doc__ or "")
+    parser.add_argument("file", type=Path, metavar="FILE", help="demonstrations, or the folder of a Minari dataset")
+    parser.add_argument("--env", metavar="TASK", help="task that they are of; their dimensions must be its own")
+    parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
+    parser.add_argument(
+        "--default-cost",
+        type=float,
+        metavar="X",
+        help="cost of every step where the file has none (default: refuse it)",
+    )
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Checks, converts and says what was written."""
+    task = options.find_task(arguments.env)
+    out: Path = arguments.out
+    if out.suffix != ".npz":
+        raise UsageError(f"--out {out}: a demonstrations file is named *.npz")
+    if out.exists() and not arguments.overwrite:
+        raise UsageError(f"--out {out}: exists; choose another name or add --overwrite")
+    if arguments.default_cost is not None and not 0 <= arguments.default_cost < float("inf"):
+        raise UsageError(f"--default-cost {arguments.default_cost}: must be finite and not negative")
+    demonstrations = load_demonstrations(arguments.file, default_cost=arguments.default_cost)
+    check_matches(demonstrations, arguments.file, task)
+    command_line.check_writable(out.parent, "--out")
+    facts = {"task": task.name, "source": arguments.file.name, "command": command_line.command()}
+    save_demonstrations(out, dataclasses.replace(demonstrations, metadata={**demonstrations.metadata, **facts}))
+    print(_summary(demonstrations, out))
+
+
+def _summary(demonstrations: Demonstrations, out: Path) -> str:
+    mean_return = demonstrations.mean_episode_return
+    return (
+        f"{out}: {demonstrations.num_episodes} trajectories, {demonstrations.num_steps} steps, mean return "
+        f"{'unknown' if mean_return is None else f'{mean_return:g}'}, mean cost {demonstrations.mean_episode_cost:g}"
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
