@@ -280,6 +280,11 @@ def validate(config: Config) -> None:
             f"--multiplier_update {config.multiplier_update}: has no parameter for malm's outer step; use adam or sgd, "
             f"or --method ccil"
         )
+    if config.standardize_cost_advantage and (config.method == "cpo_il" or config.multiplier_update == "optimal"):
+        raise ConfigError(
+            "--standardize_cost_advantage true: the optimal multiplier compares the surrogate of the cost with its gap, "
+            "so it must keep its unit; leave it out"
+        )
     if config.pid_smoothing >= 1:
         raise ConfigError(f"--pid_smoothing {config.pid_smoothing}: must be below 1, or no gap is ever felt")
     if config.method == "malm" and config.meta_gradient != "none" and config.num_held_out == 0:

@@ -26,7 +26,8 @@ def optimal_weights(
 
     Returns:
         [1, 0] where the plain step keeps the limit, or no step can change the cost; [1, -nu] where the limit binds;
-        [0, -1], the recovery, where no step within the radius reaches it.
+        [0, -1], the recovery, where no step within the radius reaches it, or above it where reward and cost rise along
+        the same line, so that nothing is left to gain.
     """
     q, r, s = gram[0, 0], gram[0, 1], gram[1, 1]
     felt = s > jnp.finfo(gram.dtype).tiny
@@ -37,7 +38,8 @@ def optimal_weights(
     inverse_scale = jnp.sqrt(unexplained / jnp.where(room > 0, room, 1.0))
     nu = jnp.maximum((r + inverse_scale * gap) / safe_s, 0.0)
     bound = jnp.stack([jnp.ones_like(nu), jnp.where(plain | ~felt, 0.0, -nu)])
-    recover = felt & (gap > 0) & (room <= 0)
+    one_line = unexplained <= 10 * jnp.finfo(gram.dtype).eps * q
+    recover = felt & (gap > 0) & ((room <= 0) | one_line) & ~plain
     return jnp.where(recover, jnp.array([0.0, -1.0], gram.dtype), bound)
 
 

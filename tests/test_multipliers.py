@@ -93,7 +93,7 @@ def test_the_optimal_multiplier_solves_400_random_problems() -> None:
         general = solve(problem)
         np.testing.assert_allclose(problem.reward @ step, problem.reward @ general, rtol=1e-5, atol=1e-7)
         if weights[1] != 0:
-            np.testing.assert_allclose(-weights[1], bisect(problem), rtol=1e-8)
+            np.testing.assert_allclose(-weights[1], bisect(problem), rtol=1e-9)
             np.testing.assert_allclose(problem.gap + problem.cost @ step, 0.0, atol=1e-10)
     assert min(kinds.values()) > 40, kinds
 
@@ -107,6 +107,18 @@ def test_parallel_gradients_are_solved_too() -> None:
     """Reward and cost rise together, the cost is at its limit: nothing can be gained, and nothing becomes NaN."""
     weights = multipliers.optimal_weights(jnp.array([[1.0, 2.0], [2.0, 4.0]]), jnp.asarray(0.0), 0.01)
     np.testing.assert_allclose(weights, [1.0, -0.5], rtol=1e-6)
+
+
+@pytest.mark.parametrize("gram", [[[1.0, 2.0], [2.0, 4.0]], [[0.0, 0.0], [0.0, 1.0]]])
+def test_above_the_limit_with_nothing_to_gain_the_cost_is_descended(gram: list[list[float]]) -> None:
+    """Reward and cost rise together, or there is no reward at all."""
+    np.testing.assert_array_equal(multipliers.optimal_weights(jnp.array(gram), jnp.asarray(0.05), 0.5), [0.0, -1.0])
+
+
+def test_a_standardised_cost_has_not_the_unit_of_the_gap() -> None:
+    for choice in ({"method": "cpo_il"}, {"method": "ccil", "multiplier_update": "optimal"}):
+        with pytest.raises(ConfigError, match="standardize_cost_advantage"):
+            validate(Config(**choice, standardize_cost_advantage=True))
 
 
 GAINS = Gains(proportional=0.5, integral=0.1, derivative=2.0, smoothing=0.5)

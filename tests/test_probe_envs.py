@@ -124,6 +124,19 @@ def test_the_multiplier_settles_where_the_kkt_conditions_put_it() -> None:
     np.testing.assert_allclose(np.exp(policy["log_std"][:, 0]), DEVIATION, rtol=0.2)
 
 
+def test_a_pid_controller_settles_there_too() -> None:
+    check_settled(train_on_conflict(multiplier_update="pid", pid_integral_gain=0.1))
+
+
+def test_the_optimal_multiplier_of_each_step_keeps_the_cost_at_its_limit() -> None:
+    """It has no memory, so it follows the noise of each batch: its mean is judged, and the cost."""
+    result = train_on_conflict(multiplier_update="optimal")
+    half = len(result.metrics["cost_weight"]) // 2
+    np.testing.assert_allclose(result.metrics["episode_cost"][half:].mean(axis=0), COST_LIMIT, rtol=0.05)
+    weight = np.median(result.metrics["cost_weight"][half:], axis=0)
+    np.testing.assert_allclose(weight, MULTIPLIER, rtol=0.25)
+
+
 def test_swapping_reward_and_cost_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mutation that the test above must catch: the learner takes the one's advantage for the other's."""
     monkeypatch.setattr(on_policy, "REWARD", 1)
