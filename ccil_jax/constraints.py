@@ -2,7 +2,7 @@
 
 The policy step moves along `weights @ [x_r, x_c]`, the natural directions of the reward and the cost surrogate. A
 constraint chooses the weights (`combine`) and learns from the episode cost (`update`). `cost_gap` is J_k - J_E: the
-mean cost of finished episodes less the limit.
+mean cost of finished episodes less the limit; `step_gap` is the same per step, the unit of the surrogates.
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ccil_jax.config import Config
+from ccil_jax.multipliers import Gains, optimal_weights, pid_init, pid_step
 from ccil_jax.types import Metrics, PyTree
 
 # Adam moves xi by about its learning rate an update, so after a long time within the limit a vanishing softplus(xi)
@@ -57,7 +58,7 @@ class Constraint(NamedTuple):
     init: Callable[[], PyTree]
     multiplier: Callable[[PyTree], jax.Array]  # state -> lambda >= 0
     gate: Callable[[jax.Array, jax.Array, Episodes], jax.Array]  # A_r, A_c, episodes -> A_r, all [T, N]
-    combine: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # lambda, cost_gap, gram [2, 2] -> weights [2]
+    combine: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # lambda, step_gap, gram [2, 2] -> weights [2]
     update: Callable[[PyTree, jax.Array, Outer | None], tuple[PyTree, Metrics]]  # state, cost_gap, outer
     entropy_in_cost: bool = False
 
@@ -72,20 +73,57 @@ def unconstrained(config: Config) -> Constraint:
         init=lambda: (),
         multiplier=lambda state: jnp.zeros(()),
         gate=_no_gate,
-        combine=lambda multiplier, cost_gap, gram: jnp.array([1.0, 0.0]),
+        combine=lambda multiplier, step_gap, gram: jnp.array([1.0, 0.0]),
         update=lambda state, cost_gap, outer: (state, {}),
     )
 
 
 def lagrangian(config: Config) -> Constraint:
-    """Reward less lambda times cost, lambda by dual ascent on the cost gap (Algorithm 1 line 14)."""
+    """Reward less lambda times cost, lambda by `config.multiplier_update`; dual ascent is Algorithm 1 line 14."""
+    if config.multiplier_update == "pid":
+        return pid(config)
+    if config.multiplier_update == "optimal":
+        return trust_region_optimal(config)
     multiplier = ascent(config)
     return Constraint(
         init=multiplier.init,
         multiplier=multiplier.read,
         gate=_no_gate,
-        combine=lambda multiplier, cost_gap, gram: jnp.stack([jnp.ones_like(multiplier), -multiplier]),
+        combine=_less_cost,
         update=lambda state, cost_gap, outer: (multiplier.dual(state, cost_gap), {}),
+    )
+
+
+def _less_cost(multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array) -> jax.Array:
+    return jnp.stack([jnp.ones_like(multiplier), -multiplier])
+
+
+def pid(config: Config) -> Constraint:
+    """Reward less lambda times cost, lambda from a PID controller of the cost gap relative to the limit."""
+    gains = Gains(
+        proportional=config.pid_proportional_gain,
+        integral=config.pid_integral_gain,
+        derivative=config.pid_derivative_gain,
+        smoothing=config.pid_smoothing,
+    )
+    scale = jnp.maximum(jnp.asarray(config.cost_limit, jnp.result_type(float)), 1.0)
+    return Constraint(
+        init=lambda: pid_init(config.initial_multiplier),
+        multiplier=lambda state: state.multiplier,
+        gate=_no_gate,
+        combine=_less_cost,
+        update=lambda state, cost_gap, outer: (pid_step(state, cost_gap / scale, gains, config.multiplier_max), {}),
+    )
+
+
+def trust_region_optimal(config: Config) -> Constraint:
+    """The multiplier that is optimal for this one step, in closed form (constrained policy optimisation): no memory."""
+    return Constraint(
+        init=lambda: (),
+        multiplier=lambda state: jnp.zeros(()),
+        gate=_no_gate,
+        combine=lambda multiplier, step_gap, gram: optimal_weights(gram, step_gap, config.max_kl),
+        update=lambda state, cost_gap, outer: (state, {}),
     )
 
 
@@ -143,8 +181,8 @@ def outer_gradient(
 def alternating(config: Config) -> Constraint:
     """Ascend the reward while the cost is within the limit, else descend the cost (Algorithm 2 lines 8 to 11)."""
 
-    def by_batch(multiplier: jax.Array, cost_gap: jax.Array, gram: jax.Array) -> jax.Array:
-        return jnp.where(cost_gap <= 0, jnp.array([1.0, 0.0]), jnp.array([0.0, -1.0]))
+    def by_batch(multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array) -> jax.Array:
+        return jnp.where(step_gap <= 0, jnp.array([1.0, 0.0]), jnp.array([0.0, -1.0]))
 
     def by_episode(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
         mixed = jnp.where(episodes.cost <= episodes.limit, reward_advantage, -cost_advantage)

@@ -1,4 +1,4 @@
-"""Diagonal Gaussian with state-independent deviation: the policy's distribution over actions."""
+"""Diagonal Gaussians, plain or squashed into the range of the actions: the policy's distribution over actions."""
 
 import math
 
@@ -13,12 +13,34 @@ class Gaussian:
     """A batch of independent normal distributions over actions."""
 
     mean: jax.Array  # [..., action_dim]
-    log_std: jax.Array  # [action_dim]
+    log_std: jax.Array  # [action_dim], or [..., action_dim] inside a `TanhGaussian`
 
 
-def sample(distribution: Gaussian, noise: Float[Array, "... A"]) -> Float[Array, "... A"]:
-    """The actions that standard normal `noise` maps to."""
+@struct.dataclass(kw_only=True)
+class TanhGaussian:
+    """Actions `center + half_range * u`, u = tanh of a Gaussian whose deviation depends on the state."""
+
+    gaussian: Gaussian  # both leaves [..., action_dim]
+    center: jax.Array  # [action_dim]
+    half_range: jax.Array  # [action_dim]
+
+
+def sample(distribution: Gaussian | TanhGaussian, noise: Float[Array, "... A"]) -> Float[Array, "... A"]:
+    """The actions that standard normal `noise` maps to; no noise gives the mode (of the Gaussian before squashing)."""
+    if isinstance(distribution, TanhGaussian):
+        return distribution.center + distribution.half_range * jnp.tanh(sample(distribution.gaussian, noise))
     return distribution.mean + jnp.exp(distribution.log_std) * noise
+
+
+def sample_unit(
+    distribution: TanhGaussian, noise: Float[Array, "... A"]
+) -> tuple[Float[Array, "... A"], Float[Array, "..."]]:
+    """The squashed sample u in (-1, 1), before it is scaled to the actions' range, and its log density in u, nats."""
+    raw = sample(distribution.gaussian, noise)
+    # log(1 - tanh(x)^2), which loses no precision where tanh saturates
+    log_slope = 2 * (math.log(2) - raw - jax.nn.softplus(-2 * raw))
+    density = -0.5 * (noise**2 + math.log(2 * math.pi)) - distribution.gaussian.log_std - log_slope
+    return jnp.tanh(raw), jnp.sum(density, axis=-1)
 
 
 def log_prob(distribution: Gaussian, action: Float[Array, "... A"]) -> Float[Array, "..."]:

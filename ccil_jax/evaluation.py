@@ -66,8 +66,8 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
     return jax.lax.scan(step, (start, running), keys)[1]
 
 
-def _gaussian(config: Config, env: Environment, actor: Actor, deterministic: bool) -> Act:
-    policy = networks.make_policy(config, env.obs_dim, env.action_dim)
+def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool) -> Act:
+    policy = networks.policy_of(config, env)
 
     def policy_act(obs: jax.Array, key: jax.Array) -> jax.Array:
         shape = (*obs.shape[:-1], env.action_dim)
@@ -112,7 +112,7 @@ def evaluate(
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None))
     def run(actor: Actor, key: jax.Array) -> Evaluation:
-        return _totals(run_episodes(env, _gaussian(config, env, actor, deterministic), num_episodes, key))
+        return _totals(run_episodes(env, _learnt(config, env, actor, deterministic), num_episodes, key))
 
     return jax.tree.map(np.asarray, run(actor, key))
 
@@ -140,7 +140,7 @@ def record(
 
     @jax.jit
     def run(actor: Actor, key: jax.Array) -> Episodes:
-        return run_episodes(env, _gaussian(config, env, actor, False), num_episodes, key)
+        return run_episodes(env, _learnt(config, env, actor, False), num_episodes, key)
 
     episodes = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
     keep = episodes.valid.T  # [N, T]: episode after episode

@@ -21,6 +21,8 @@ METHODS: Mapping[str, Method] = {
     "cvag": Method("discriminator", constraints.alternating, "expert"),
     "ccil": Method("discriminator", constraints.lagrangian, "expert"),
     "lgail": Method("discriminator", constraints.lagrangian, "prescribed"),
+    "cpo_il": Method("discriminator", constraints.trust_region_optimal, "expert"),
+    "pid_il": Method("discriminator", constraints.pid, "expert"),
     "gail": Method("discriminator", constraints.unconstrained, "none"),
     "trpo": Method("task", constraints.unconstrained, "none"),
     "expert": Method("task", constraints.lagrangian, "prescribed"),

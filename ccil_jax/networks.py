@@ -1,4 +1,4 @@
-"""The three networks: Gaussian policy, critic and discriminator. The rest of the package sees only init and apply."""
+"""The networks: policies, critics and discriminator. The rest of the package sees only init and apply."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ccil_jax.config import Config
-from ccil_jax.distributions import Gaussian
+from ccil_jax.distributions import Gaussian, TanhGaussian
 from ccil_jax.types import PyTree
+from envs.base import Environment
 
 ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
 
@@ -51,6 +52,13 @@ class Policy(NamedTuple):
     apply: Callable[[PyTree, jax.Array], Gaussian]
 
 
+class SquashedPolicy(NamedTuple):
+    """`init(key) -> params`; `apply(params, obs) -> TanhGaussian`."""
+
+    init: Callable[[jax.Array], PyTree]
+    apply: Callable[[PyTree, jax.Array], TanhGaussian]
+
+
 def _mlp(config: Config, out: int, final_scale: float) -> MLP:
     return MLP((*config.hidden_sizes, out), ACTIVATIONS[config.activation], final_scale)
 
@@ -71,6 +79,36 @@ def make_policy(config: Config, obs_dim: int, action_dim: int, initial_std: jax.
         return Gaussian(mean=mean, log_std=params["log_std"])
 
     return Policy(init, apply)
+
+
+LOG_STD_RANGE = (-5.0, 2.0)  # of a squashed policy (the published code of IQ-Learn, after pytorch_sac)
+
+
+def make_squashed_policy(config: Config, env: Environment) -> SquashedPolicy:
+    """Tanh-Gaussian policy within the environment's action range; mean and deviation from one MLP."""
+    mlp = _mlp(config, 2 * env.action_dim, final_scale=1.0)
+    low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
+    smallest, largest = LOG_STD_RANGE
+
+    def init(key: jax.Array) -> PyTree:
+        return {"squashed": mlp.init(key, jnp.zeros((1, env.obs_dim)))}
+
+    def apply(params: PyTree, obs: Float[Array, "... D"]) -> TanhGaussian:
+        output: jax.Array = mlp.apply(params["squashed"], obs)  # type: ignore[assignment]  # flax: Any or a tuple
+        mean, spread = jnp.split(output, 2, axis=-1)
+        log_std = smallest + (largest - smallest) * (jnp.tanh(spread) + 1) / 2
+        return TanhGaussian(
+            gaussian=Gaussian(mean=mean, log_std=log_std), center=(low + high) / 2, half_range=(high - low) / 2
+        )
+
+    return SquashedPolicy(init, apply)
+
+
+def policy_of(config: Config, env: Environment) -> Policy | SquashedPolicy:
+    """The policy network of `config.method`, for acting with parameters that were learnt."""
+    if config.method == "iq_learn":
+        return make_squashed_policy(config, env)
+    return make_policy(config, env.obs_dim, env.action_dim)
 
 
 def make_scalar(config: Config, input_dim: int, final_scale: float = 1.0) -> Network:

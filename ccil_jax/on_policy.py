@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +26,10 @@ REWARD, COST = 0, 1  # order along every axis of length 2: critics, signals, dir
 
 
 class Agent(NamedTuple):
-    """What the runner knows of a learner: pure functions of one seed."""
+    """What the runner knows of a learner: pure functions of one seed. A state has a field `actor`, an `Actor`."""
 
-    init: Callable[[jax.Array], "AgentState"]
-    step: Callable[["AgentState"], tuple["AgentState", Metrics]]  # one iteration
+    init: Callable[[jax.Array], Any]  # key -> state
+    step: Callable[[Any], tuple[Any, Metrics]]  # one iteration
 
 
 @struct.dataclass(kw_only=True)
@@ -56,13 +56,16 @@ class AgentState:
     key: jax.Array
 
 
+def initial_std(env: Environment) -> np.ndarray:
+    """1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped."""
+    return np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
+
+
 def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     """Builds the agent of `config.method`. `config.cost_limit` must be set; `expert` is None for task rewards."""
     method = METHODS[config.method]
     constraint = method.constraint(config)
-    # 1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped.
-    initial_std = np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
-    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std)
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
     critic = networks.make_scalar(config, env.obs_dim)
     if method.reward == "discriminator":
         assert expert is not None, f"{config.method} learns from demonstrations"
@@ -89,7 +92,9 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             key=key,
         )
 
-    def generator_step(state: AgentState, key: jax.Array) -> tuple[AgentState, tuple[Transition, PolicyStep, Metrics]]:
+    def generator_step(
+        state: AgentState, key: jax.Array
+    ) -> tuple[AgentState, tuple[Transition, PolicyStep, jax.Array, Metrics]]:
         rollout_key, split_key, critic_key = jax.random.split(key, 3)
         rollout_state, transition = rollout.rollout(
             env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
@@ -100,12 +105,15 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
 
         episodes = episodes_of_steps(transition, limit, env.max_episode_steps)
         samples, mean_reward = assess(config, critic.apply, reward_model, constraint, state, transition, episodes)
-        held_out, training = policy_step.split(samples, config.num_held_out, split_key)
+        order = policy_step.random_order(config, split_key)
+        held_out, training = policy_step.split(samples, config.num_held_out, order)
+        step_gap = cost_gap / jnp.maximum(estimates.episode_length, 1.0)
         params, taken, step_metrics = policy_step.improve(
-            config, policy.apply, constraint, state.actor.policy_params, training, multiplier, cost_gap, held_out
+            config, policy.apply, constraint, state.actor.policy_params, training, multiplier, step_gap, held_out
         )
         critics, critic_losses = fit_critics(config, critic.apply, state.critics, training, critic_key)
 
+        assert state.actor.obs_statistics is not None
         statistics = running_statistics.update(state.actor.obs_statistics, transition.obs)
         metrics = step_metrics | {
             "episodes_finished": finished,
@@ -121,16 +129,26 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             rollout=rollout_state,
             estimates=estimates,
         )
-        return new, (transition, taken, metrics)
+        return new, (transition, taken, order, metrics)
+
+    def reassess(state: AgentState, reward_state: PyTree, transition: Transition, order: jax.Array) -> Batch:
+        """The held-out samples of the last batch, with advantages by the updated critics and reward model."""
+        updated = dataclasses.replace(state, reward_model=reward_state)
+        episodes = episodes_of_steps(transition, limit, env.max_episode_steps)
+        samples, _ = assess(config, critic.apply, reward_model, constraint, updated, transition, episodes)
+        held_out, _ = policy_step.split(samples, config.num_held_out, order)
+        return held_out
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, generator_key, reward_key = jax.random.split(state.key, 3)
         generator_keys = jax.random.split(generator_key, config.generator_steps)
         state, outputs = jax.lax.scan(generator_step, state, generator_keys)
-        transition, taken, _ = jax.tree.map(lambda x: x[-1], outputs)
-        generator_metrics = outputs[2]
+        transition, taken, order, _ = jax.tree.map(lambda x: x[-1], outputs)
+        generator_metrics = outputs[3]
 
         reward_state, reward_metrics = reward_model.update(state.reward_model, transition, reward_key)
+        if config.num_held_out and config.outer_advantage == "re-evaluated":
+            taken = dataclasses.replace(taken, held_out=reassess(state, reward_state, transition, order))
         outer = policy_step.outer_problem(config, policy.apply, constraint, taken) if config.num_held_out else None
         cost_gap = state.estimates.episode_cost - limit
         constraint_state, constraint_metrics = constraint.update(state.constraint, cost_gap, outer)

@@ -26,14 +26,22 @@ class PolicyStep:
     policy_params: PyTree  # theta_k
     directions: Directions
     fraction: jax.Array  # [] of the line search; 0 if it was rejected, and then the replay stands still
-    cost_gap: jax.Array  # [] J_k - J_E when the step was taken
+    step_gap: jax.Array  # [] J_k - J_E per step, when it was taken
     held_out: Batch  # [V]
 
 
-def split(samples: Batch, num_held_out: int, key: jax.Array) -> tuple[Batch, Batch]:
-    """A random partition into [V] held-out and [M] training samples (Algorithm 1 line 8); untouched if V is 0."""
+def random_order(config: Config, key: jax.Array) -> jax.Array:
+    """Indices [K] of a batch's samples, the V held out first. Samples are numbered simulation by simulation fastest."""
+    if config.held_out_unit == "transition":
+        return permutation(key, config.batch_size)
+    simulations = permutation(key, config.num_envs)  # a simulation's whole stretch of the batch stays together
+    steps = jnp.arange(config.num_steps) * config.num_envs
+    return (simulations[:, None] + steps).reshape(-1)
+
+
+def split(samples: Batch, num_held_out: int, order: jax.Array) -> tuple[Batch, Batch]:
+    """A partition into [V] held-out and [M] training samples (Algorithm 1 line 8); untouched if V is 0."""
     if num_held_out:
-        order = permutation(key, samples.cost.shape[0])
         samples = jax.tree.map(lambda x: x[order], samples)
     return jax.tree.map(lambda x: x[:num_held_out], samples), jax.tree.map(lambda x: x[num_held_out:], samples)
 
@@ -50,7 +58,7 @@ def improve(
     policy_params: PyTree,
     batch: Batch,
     multiplier: jax.Array,
-    cost_gap: jax.Array,
+    step_gap: jax.Array,
     held_out: Batch,
 ) -> tuple[PyTree, PolicyStep, Metrics]:
     """The policy step on the training samples (Algorithm 1 line 10, Algorithm 2 lines 8 to 11)."""
@@ -72,7 +80,7 @@ def improve(
         lambda params: policy_apply(unravel(params), fisher_obs), params, config.cg_damping
     )
     directions = trust_region.directions(product, gradients, config.cg_iterations)
-    weights = constraint.combine(multiplier, cost_gap, directions.gram)
+    weights = constraint.combine(multiplier, step_gap, directions.gram)
     new_params, fraction, metrics = trust_region.step(
         params,
         directions,
@@ -85,9 +93,9 @@ def improve(
     # A rejected step replays as standing still, also where its directions were not finite (0 times NaN is NaN).
     replayed = jax.tree.map(lambda leaf: jnp.where(fraction > 0, leaf, 0.0), directions)
     taken = PolicyStep(
-        policy_params=policy_params, directions=replayed, fraction=fraction, cost_gap=cost_gap, held_out=held_out
+        policy_params=policy_params, directions=replayed, fraction=fraction, step_gap=step_gap, held_out=held_out
     )
-    return unravel(new_params), taken, metrics
+    return unravel(new_params), taken, metrics | {"cost_weight": -weights[1]}
 
 
 def outer_problem(
@@ -101,7 +109,7 @@ def outer_problem(
         return distributions.log_prob(policy_apply(unravel(params), held_out.obs), held_out.action)
 
     def importance_weights(multiplier: jax.Array) -> jax.Array:
-        weights = constraint.combine(multiplier, taken.cost_gap, taken.directions.gram)
+        weights = constraint.combine(multiplier, taken.step_gap, taken.directions.gram)
         new_params = trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
         return importance(log_prob(new_params), log_prob(old_params))
 

@@ -15,10 +15,9 @@ import jax
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from ccil_jax import on_policy
+from ccil_jax import agents
 from ccil_jax.config import Config
-from ccil_jax.on_policy import AgentState
-from ccil_jax.types import ExpertData, Metrics
+from ccil_jax.types import ExpertData, Metrics, PyTree
 from envs.base import Environment
 
 LONGEST_CHUNK = 10  # iterations between two looks from Python
@@ -30,9 +29,9 @@ NONE_VARIED: Varied = MappingProxyType({})
 class Program:
     """The compiled functions of R runs that share their static hyperparameters."""
 
-    init: Callable[[jax.Array], AgentState]  # keys [R] -> state
-    state: AgentState  # shapes, dtypes and shardings
-    chunk: Callable[[AgentState], tuple[AgentState, Metrics]]  # state (donated) -> state, metrics [R, chunk_length]
+    init: Callable[[jax.Array], PyTree]  # keys [R] -> state
+    state: PyTree  # shapes, dtypes and shardings
+    chunk: Callable[[PyTree], tuple[PyTree, Metrics]]  # state (donated) -> state, metrics [R, chunk_length]
     chunk_length: int
     compile_seconds: float
     text: Callable[[], str]  # of `chunk`, as XLA has compiled it
@@ -83,17 +82,15 @@ def compile_program(
     chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if common % n == 0)
     mesh = run_mesh(num_runs)
 
-    def init(config: Config, expert: ExpertData | None, varied: Varied, keys: jax.Array) -> AgentState:
-        def init_run(values: Varied, key: jax.Array) -> AgentState:
-            return on_policy.make(config.replace(**values), env, expert).init(key)
+    def init(config: Config, expert: ExpertData | None, varied: Varied, keys: jax.Array) -> PyTree:
+        def init_run(values: Varied, key: jax.Array) -> PyTree:
+            return agents.make(config.replace(**values), env, expert).init(key)
 
         return over_runs(init_run, one_by_one)(varied, keys)
 
-    def chunk(
-        config: Config, expert: ExpertData | None, varied: Varied, state: AgentState
-    ) -> tuple[AgentState, Metrics]:
-        def iterate(values: Varied, state: AgentState) -> tuple[AgentState, Metrics]:
-            agent = on_policy.make(config.replace(**values), env, expert)
+    def chunk(config: Config, expert: ExpertData | None, varied: Varied, state: PyTree) -> tuple[PyTree, Metrics]:
+        def iterate(values: Varied, state: PyTree) -> tuple[PyTree, Metrics]:
+            agent = agents.make(config.replace(**values), env, expert)
             return jax.lax.scan(lambda state, _: agent.step(state), state, None, length=chunk_length)
 
         return over_runs(iterate, one_by_one)(varied, state)

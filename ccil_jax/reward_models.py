@@ -6,7 +6,7 @@ h = -logit(D) and its reward -log D is softplus(h): an expert-like learner earns
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -82,6 +82,32 @@ def gradient_penalty(
     return jnp.mean((jnp.sqrt(jnp.sum(slopes**2, axis=-1) + 1e-12) - 1) ** 2)
 
 
+def spectrally_normalized(network: Network) -> Network:
+    """The network with every kernel divided by its largest singular value (Miyato et al. 2018): Lipschitz 1 or less."""
+
+    def normalize(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
+        return leaf / largest_singular_value(leaf) if path[-1].key == "kernel" else leaf
+
+    def apply(params: PyTree, inputs: jax.Array) -> jax.Array:
+        return network.apply(jax.tree_util.tree_map_with_path(normalize, params), inputs)
+
+    return Network(network.init, apply)
+
+
+def largest_singular_value(matrix: Float[Array, "N M"], num_iterations: int = 20) -> Float[Array, ""]:
+    """By power iteration from a fixed random vector (no LAPACK: see `test_no_seed_waits_for_anothers_thread`)."""
+
+    def iterate(right: jax.Array, _: None) -> tuple[jax.Array, None]:
+        image = matrix.T @ (matrix @ right)
+        return image / (jnp.linalg.norm(image) + 1e-12), None
+
+    start = jax.random.normal(jax.random.key(0), matrix.shape[1:], matrix.dtype)
+    right = jax.lax.stop_gradient(jax.lax.scan(iterate, start, None, length=num_iterations)[0])
+    left = jax.lax.stop_gradient(matrix @ right)
+    # Constant singular vectors: the derivative is that of u.W v, the outer product of the two, as it should be.
+    return (left / (jnp.linalg.norm(left) + 1e-12)) @ matrix @ right
+
+
 def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim: int) -> RewardModel:
     """The adversarial reward of GAIL (Ho and Ermon 2016).
 
@@ -89,6 +115,8 @@ def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim:
     beyond the range would earn alike, and a policy whose mean has left the range would have no way back.
     """
     optimizer = optax.adam(config.discriminator_learning_rate)
+    if config.discriminator_regularizer == "spectral_norm":
+        network = spectrally_normalized(network)
 
     def inputs(statistics: RunningStatistics, obs: jax.Array, action: jax.Array) -> jax.Array:
         return jnp.concatenate([running_statistics.normalize(statistics, obs), action], axis=-1)

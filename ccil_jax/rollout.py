@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from ccil_jax import distributions, running_statistics
-from ccil_jax.distributions import Gaussian
+from ccil_jax.distributions import Gaussian, TanhGaussian
 from ccil_jax.running_statistics import RunningStatistics
 from ccil_jax.types import PyTree, Transition
 from envs.base import Environment, State, compute_where
@@ -19,7 +19,7 @@ class Actor:
     """Everything needed to act: [S]-leading when seeds are vmapped."""
 
     policy_params: PyTree
-    obs_statistics: RunningStatistics
+    obs_statistics: RunningStatistics | None  # None: the network sees observations as they are
 
 
 @struct.dataclass(kw_only=True)
@@ -31,9 +31,10 @@ class RolloutState:
     whole: jax.Array  # [N] bool: false for a first episode that was shortened to desynchronise the environments
 
 
-def act(
-    policy_apply: Callable[[PyTree, jax.Array], Gaussian], actor: Actor, obs: jax.Array, noise: jax.Array
-) -> jax.Array:
+PolicyApply = Callable[[PyTree, jax.Array], Gaussian] | Callable[[PyTree, jax.Array], TanhGaussian]
+
+
+def act(policy_apply: PolicyApply, actor: Actor, obs: jax.Array, noise: jax.Array) -> jax.Array:
     """Actions [..., action_dim] for standard normal `noise`; zero noise gives the mode."""
     distribution = policy_apply(actor.policy_params, running_statistics.normalize(actor.obs_statistics, obs))
     return distributions.sample(distribution, noise)
@@ -52,7 +53,7 @@ def init(env: Environment, num_envs: int, key: jax.Array) -> RolloutState:
 
 def rollout(
     env: Environment,
-    policy_apply: Callable[[PyTree, jax.Array], Gaussian],
+    policy_apply: PolicyApply,
     actor: Actor,
     state: RolloutState,
     num_steps: int,

@@ -10,14 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import on_policy
+from ccil_jax import agents, iq_learn
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, field_names, validate
 from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.on_policy import AgentState
 from ccil_jax.program import compile_program
 from ccil_jax.rollout import Actor
-from ccil_jax.types import ExpertData, Metrics
+from ccil_jax.types import ExpertData, ExpertTransitions, Metrics, PyTree
 from envs.base import Environment
 
 CHECKPOINT_SECONDS = 60.0  # at most this much work is lost, plus one chunk
@@ -42,7 +41,7 @@ class Result:
 
     config: Config  # as resolved: cost_limit is set
     metrics: History  # [iterations, num_seeds] each
-    state: AgentState  # [num_seeds]-leading
+    state: PyTree  # [num_seeds]-leading
     env_steps: int  # per seed
     compile_seconds: float
     wall_seconds: float  # of this call, compilation included
@@ -76,6 +75,14 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         config = config.replace(cost_limit=float(demonstrations.mean_episode_cost))
     elif config.cost_limit is None and config.method not in PRESCRIBED_LIMIT_METHODS:
         config = config.replace(cost_limit=0.0)  # enters nothing
+    if (
+        config.method == "iq_learn"
+        and demonstrations is not None
+        and demonstrations.num_steps == len(demonstrations.episode_ends)
+    ):
+        raise ConfigError("demonstrations: every trajectory is one step long, so no step's successor is known")
+    if config.method == "iq_learn" and config.temperature is None:
+        config = config.replace(temperature=iq_learn.TEMPERATURES.get(env.name, iq_learn.USUAL_TEMPERATURE))
     validate(config)
     return config
 
@@ -91,6 +98,22 @@ def expert_data(demonstrations: Demonstrations | None) -> ExpertData | None:
         action=jnp.asarray(demonstrations.actions[:num_training]),
         held_out_obs=jnp.asarray(demonstrations.obs[held_out]),
         held_out_action=jnp.asarray(demonstrations.actions[held_out]),
+        transitions=expert_transitions(demonstrations),
+    )
+
+
+def expert_transitions(demonstrations: Demonstrations) -> ExpertTransitions:
+    """The steps whose successor is known: an episode's last step is one only where the task ended."""
+    ends, obs = demonstrations.episode_ends, demonstrations.obs
+    last = np.zeros(len(obs), bool)
+    last[ends - 1] = True
+    known = np.flatnonzero(~last | demonstrations.terminated)
+    return ExpertTransitions(
+        obs=jnp.asarray(obs[known]),
+        action=jnp.asarray(demonstrations.actions[known]),
+        next_obs=jnp.asarray(obs[np.minimum(known + 1, len(obs) - 1)]),
+        terminated=jnp.asarray(demonstrations.terminated[known], jnp.result_type(float)),
+        initial_obs=jnp.asarray(obs[np.concatenate([[0], ends[:-1]])]),
     )
 
 
@@ -243,8 +266,7 @@ def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, j
 def save(result: Result, directory: Path) -> None:
     """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs."""
     with Checkpointer(directory) as checkpoints:
-        iterations = result.env_steps // result.config.steps_per_iteration
-        checkpoints.save(iterations, {"state": result.state, "history": result.metrics})
+        checkpoints.save(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
 
 
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
@@ -253,16 +275,15 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     Raises:
         FileNotFoundError: there is no finished checkpoint.
     """
-    config = config.replace(cost_limit=config.cost_limit or 0.0)
-    steps = ExpertData(
-        obs=jnp.zeros((1, env.obs_dim)),
-        action=jnp.zeros((1, env.action_dim)),
-        held_out_obs=jnp.zeros((1, env.obs_dim)),
-        held_out_action=jnp.zeros((1, env.action_dim)),
-    )  # only their widths matter
+    config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
+    obs, action = jnp.zeros((1, env.obs_dim)), jnp.zeros((1, env.action_dim))
+    transitions = ExpertTransitions(obs=obs, action=action, next_obs=obs, terminated=jnp.zeros(1), initial_obs=obs)
+    steps = ExpertData(  # only their widths matter
+        obs=obs, action=action, held_out_obs=obs, held_out_action=action, transitions=transitions
+    )
 
-    def init(key: jax.Array) -> AgentState:
-        return jax.vmap(on_policy.make(config, env, steps).init)(jax.random.split(key, num_seeds))
+    def init(key: jax.Array) -> PyTree:
+        return jax.vmap(agents.make(config, env, steps).init)(jax.random.split(key, num_seeds))
 
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     like = jax.tree.map(

@@ -44,6 +44,8 @@ def std(statistics: RunningStatistics) -> Float[Array, " D"]:
     return jnp.where(statistics.count > 0, jnp.maximum(jnp.sqrt(variance), 1e-2), 1.0)
 
 
-def normalize(statistics: RunningStatistics, samples: Float[Array, "... D"]) -> Float[Array, "... D"]:
-    """Zero mean, unit deviation, clipped to [-5, 5]."""
+def normalize(statistics: RunningStatistics | None, samples: Float[Array, "... D"]) -> Float[Array, "... D"]:
+    """Zero mean, unit deviation, clipped to [-5, 5]; samples as they are where there are no statistics."""
+    if statistics is None:
+        return samples
     return jnp.clip((samples - statistics.mean) / std(statistics), -CLIP, CLIP)

@@ -43,6 +43,17 @@ class Batch:
 
 
 @struct.dataclass(kw_only=True)
+class ExpertTransitions:
+    """Steps of the demonstrations whose successor is known."""
+
+    obs: jax.Array  # [m, obs_dim]
+    action: jax.Array  # [m, action_dim]
+    next_obs: jax.Array  # [m, obs_dim] arbitrary where terminated
+    terminated: jax.Array  # [m] float: 1 where the task ended
+    initial_obs: jax.Array  # [E, obs_dim] first observation of each episode
+
+
+@struct.dataclass(kw_only=True)
 class ExpertData:
     """Demonstrations on the device."""
 
@@ -50,3 +61,4 @@ class ExpertData:
     action: jax.Array  # [n, action_dim]
     held_out_obs: jax.Array  # [h, obs_dim] never trained on: shows a discriminator that memorises
     held_out_action: jax.Array  # [h, action_dim]
+    transitions: ExpertTransitions | None = None  # what iq_learn learns from

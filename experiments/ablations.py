@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import Config
+from ccil_jax.config import PRESETS, Config
 from experiments import command_line, comparison, options, study, train
 from experiments.command_line import Parser, UsageError
 from experiments.comparison import Row
@@ -46,13 +46,34 @@ QUESTIONS: Mapping[str, Question] = {
             "sgd, 0.0005": {"multiplier_update": "sgd", "multiplier_learning_rate": 0.0005},
         },
     ),
+    "multiplier": Question(
+        "Whose multiplier, without a meta-gradient?",
+        "ccil",
+        {
+            "adam": {"multiplier_update": "adam"},
+            "sgd, 0.0005": {"multiplier_update": "sgd", "multiplier_learning_rate": 0.0005},
+            "pid": {"multiplier_update": "pid"},
+            "optimal": {"multiplier_update": "optimal"},
+        },
+    ),
+    "preset": Question(
+        "The algorithm as printed, or as its authors coded it?",
+        "malm",
+        {"paper": {}, **{name: PRESETS[name] for name in ("printed", "authors")}},
+    ),
+    "outer_advantage": _one_field(
+        "Whose advantages judge the outer step?", "outer_advantage", ("stale", "re-evaluated")
+    ),
+    "held_out_unit": _one_field("What is held out for it?", "held_out_unit", ("transition", "trajectory")),
     "multiplier_learning_rate": _one_field("How large a dual step?", "multiplier_learning_rate", (0.05, 0.01, 0.2)),
     "meta_learning_rate": _one_field("How large an outer step?", "meta_learning_rate", (0.05, 0.01, 0.2)),
     "windup": _one_field("Does a multiplier that begins too high come down?", "initial_multiplier", (0.01, 1.0, 10.0)),
     "gate": _one_field("One decision per batch or per episode?", "gate", ("batch", "episode"), method="cvag"),
     "reward_form": _one_field("Which imitation reward?", "reward_form", ("softplus", "logit", "log_sigmoid")),
     "discriminator_regularizer": _one_field(
-        "What keeps the discriminator smooth?", "discriminator_regularizer", ("gradient_penalty", "none")
+        "What keeps the discriminator smooth?",
+        "discriminator_regularizer",
+        ("gradient_penalty", "none", "spectral_norm"),
     ),
     "standardize_cost_advantage": _one_field(
         "Is the cost advantage standardised?", "standardize_cost_advantage", (False, True)

@@ -86,7 +86,7 @@ def evaluate_run(stored: Run, arguments: argparse.Namespace) -> tuple[dict[str, 
         evaluated = original.evaluate(loaded.config, loaded.agent, env, contact_cost=contact_cost, **settings)
     if arguments.export:
         facts = {"task": env.name, "original": TASKS[env.name].original, "simulator": arguments.simulator, **settings}
-        original.export(arguments.export, loaded.config, loaded.agent, evaluated, facts)
+        original.export(arguments.export, loaded.config, loaded.agent, env, evaluated, facts)
         print(f"policies {arguments.export}")
     random = evaluation.random_policy(env, num_episodes=arguments.episodes, seed=arguments.seed)
     reference = summary.Reference(

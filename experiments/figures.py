@@ -20,6 +20,10 @@ PANELS = (
     ("episode_cost", "Cost per episode"),
     ("cost_rate", "Cost rate"),
 )
+CLONING_PANELS = (  # of a method that does not act while it learns
+    ("loss", "Loss, nats"),
+    ("held_out_loss", "Loss on held-out steps, nats"),
+)
 _MAX_POINTS = 100  # of a curve: few episodes end in an iteration, and their scatter would hide the learning
 COLORS = ("#0b6e99", "#d1495b", "#6a994e", "#e09f3e", "#7b5ea7", "#3d405b", "#00a5a5", "#a44a3f")
 STYLE: Any = {
@@ -73,23 +77,31 @@ def draw_run(folder: Path) -> Path:
     task = run_folder.read_run(folder).facts["task"]
     target = folder / "figures"
     target.mkdir(exist_ok=True)
-    for name, _ in PANELS:
+    for name, _ in panels_of([curve]):
         (target / f"{name}.png").write_bytes(png(draw_panels([curve], task, [name])))
     path = target / "curves.png"
     path.write_bytes(png(draw_panels([curve], task)))
     return path
 
 
+def panels_of(curves: Sequence[Curve]) -> tuple[tuple[str, str], ...]:
+    """(metric, title) of the panels that at least one of the curves has something to show in."""
+    return tuple(panel for panel in PANELS + CLONING_PANELS if any(panel[0] in c.metrics for c in curves))
+
+
 def draw_panels(curves: Sequence[Curve], task: str, names: Sequence[str] | None = None) -> Figure:
-    """One panel per metric of `PANELS` (or of `names`), all runs overlaid."""
-    panels = [panel for panel in PANELS if names is None or panel[0] in names]
+    """One panel per metric that the runs have (or for each of `names`), all runs overlaid."""
+    panels = [panel for panel in panels_of(curves) if names is None or panel[0] in names]
     steps = {_steps_per_iteration(c) for c in curves}
     label = f"iterations of {min(steps):,} steps" if len(steps) == 1 else "environment steps per seed"
+    if steps == {0}:
+        label = "passes over the demonstrations"
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.1 * len(panels) + 0.3, 3.9), dpi=150, layout="constrained")
         for axes, (name, title) in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
             for i, curve in enumerate(curves):
-                _draw_curve(axes, curve, name, COLORS[i % len(COLORS)], by_iteration=len(steps) == 1)
+                if name in curve.metrics:
+                    _draw_curve(axes, curve, name, COLORS[i % len(COLORS)], by_iteration=len(steps) == 1)
             _draw_levels(axes, curves, name)
             axes.set_title(title)
             axes.set_xlabel(label)
@@ -142,13 +154,13 @@ def _draw_curve(axes: Axes, curve: Curve, name: str, color: str, *, by_iteration
 
 
 def _draw_levels(axes: Axes, curves: Sequence[Curve], name: str) -> None:
-    levels = sorted({level for c in curves if (level := c.expert_levels[name]) is not None})
+    levels = sorted({level for c in curves if (level := c.expert_levels.get(name)) is not None})
     for i, level in enumerate(levels):
         axes.axhline(level, color="#22262b", linewidth=1.3, linestyle=(0, (5, 3)), label=None if i else "expert")
     limits = sorted({c.cost_limit for c in curves if c.cost_limit is not None}) if name == "episode_cost" else []
     for i, limit in enumerate(limits):
         axes.axhline(limit, color="#a0281f", linewidth=1.3, linestyle=(0, (1, 2)), label=None if i else "cost limit")
-    if name != "episode_return":
+    if name in ("episode_cost", "cost_rate"):
         axes.set_ylim(bottom=0.0)  # costs are not negative, and a band below zero would mislead
 
 

@@ -198,7 +198,9 @@ def _policy_steps(config: Config, env: Any, setting: Setting) -> tuple[Work, Wor
             returns=advantages.T,
             cost=(advantages[1] > 0).astype(advantages.dtype),
         )
-        return policy.init(params_key), *policy_step.split(batch, config.num_held_out, action_key)
+        return policy.init(params_key), *policy_step.split(
+            batch, config.num_held_out, policy_step.random_order(config, action_key)
+        )
 
     @jax.jit
     @jax.vmap

@@ -14,6 +14,7 @@ from experiments.command_line import Parser, UsageError, boolean, integer, natur
 
 CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
 TASK_OPTIONS = ("cost_threshold", "contact_cost")  # some tasks have them; None leaves them to the task
+METHOD_PRESETS = {"bc": "bc", "iq_learn": "iq_learn"}  # where a method starts from one of its own
 DEFAULTS: Mapping[str, Any] = {
     "num_seeds": 3,
     "seed": 0,

@@ -57,6 +57,8 @@ class Display:
     def _status(self, progress: Any) -> str:
         latest = {name: float(np.mean(rows[-1])) for name, rows in progress.metrics.items()}
         limit = "" if self._cost_limit is None else f" / {number(self._cost_limit)}"
+        if "episode_return" not in latest:  # behaviour cloning: it does not act while it learns
+            return f"loss {number(latest['loss'])}  held out {number(latest['held_out_loss'])}"
         parts = [f"return {number(latest['episode_return'])}", f"cost {number(latest['episode_cost'])}{limit}"]
         if "multiplier" in latest:
             parts.append(f"lambda {number(latest['multiplier'])}")

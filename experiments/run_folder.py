@@ -27,6 +27,7 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "episode_length",
     "episodes_finished",
     "multiplier",
+    "cost_weight",
     "meta_gradient",
     "kl",
     "surrogate",
@@ -39,6 +40,12 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "discriminator_accuracy_held_out",
     "reward_critic_loss",
     "cost_critic_loss",
+    "critic_loss",
+    "policy_loss",
+    "recovered_reward_expert",
+    "recovered_reward_learner",
+    "loss",
+    "held_out_loss",
 )
 _FACTS = frozenset(
     {"task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations"}

@@ -54,7 +54,8 @@ def plan_of(given: Mapping[str, Any], folder: Path | None, *, resume: bool) -> P
     """The `Plan` of the options given, checked, but for its folder (a new one where it is None)."""
     if "method" not in given:
         raise UsageError(f"--method: required; one of {', '.join(METHOD_NAMES)}")
-    choices = {**options.DEFAULTS, "env": None, "demos": None, "num_demos": None, **given}
+    preset = options.METHOD_PRESETS.get(given["method"], options.DEFAULTS["preset"])
+    choices = {**options.DEFAULTS, "preset": preset, "env": None, "demos": None, "num_demos": None, **given}
     config = options.config_from(choices, choices["preset"])
     task = options.find_task(choices["env"])
     env_options = options.env_options(choices, task)

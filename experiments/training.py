@@ -80,7 +80,7 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
         several = f"{len(plans)} configurations of " if len(plans) > 1 else ""
         display.message(
             f"{first.config.method} on {first.task}: {several}{first.num_seeds} seed(s), "
-            f"{first.config.env_steps:,} steps each, into {checkpoint_dir.parent}; compiling ..."
+            f"{_length(first.config)} each, into {checkpoint_dir.parent}; compiling ..."
         )
         devices.spread_seeds(num_runs, several=first.one_by_one)
         import envs  # with JAX behind it: not before the input has been checked
@@ -105,6 +105,10 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
     ]
 
 
+def _length(config: Config) -> str:
+    return f"{config.bc_epochs} passes" if config.method == "bc" else f"{config.env_steps:,} steps"
+
+
 def _with_earlier_commands(plan: Plan) -> Plan:
     """A resumed run was made by all its commands: the first, and those that continued it."""
     earlier = [run_folder.read_run(plan.folder).facts["command"]] if plan.resume else []
@@ -127,7 +131,8 @@ def _train(
             nonlocal steps, seconds
             new_steps = progress.metrics["env_steps"].size * first.config.steps_per_iteration
             steps += new_steps
-            seconds += new_steps / progress.env_steps_per_second
+            if new_steps:  # behaviour cloning takes none
+                seconds += new_steps / progress.env_steps_per_second
             for writer, columns in zip(writers, own, strict=True):
                 writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
             display.update(progress)
@@ -212,7 +217,7 @@ def _finish(
         cost_limit=plan.config.cost_limit,
     )
     metrics = run_folder.read_metrics(plan.folder)
-    rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1], reference)
+    rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
     content = {
         "task": plan.task,

@@ -154,7 +154,7 @@ def test_the_episode_gate_takes_the_reward_on_steps_of_episodes_within_the_limit
 def test_no_other_method_gates_its_advantages() -> None:
     reward, episodes = jnp.ones((3, 2)), Episodes(cost=jnp.full((3, 2), 9.0), limit=jnp.asarray(1.0))
     for name, row in METHODS.items():
-        gated = row.constraint(Config(method=name)).gate(reward, -reward, episodes)
+        gated = row.constraint(Config(method=name, cost_limit=1.0)).gate(reward, -reward, episodes)
         np.testing.assert_array_equal(gated, reward)
 
 

@@ -63,3 +63,23 @@ def test_fisher_product_is_the_curvature_of_the_divergence(dimension: int) -> No
             moved = [gaussian(MEAN[:1] + s * h * mean[None], LOG_STD + s * h * log_std) for s in (1, -1)]
             curvature = sum(distributions.kl_divergence(at, other)[0] for other in moved) / h**2
             np.testing.assert_allclose(product, curvature, rtol=1e-5)
+
+
+def test_a_squashed_sample_has_the_density_of_a_change_of_variables() -> None:
+    """log p(u) = log N(atanh u) + log d(atanh u) / du, by SciPy in float64; and it integrates to 1."""
+    gaussian = distributions.Gaussian(mean=jnp.array([[0.3, -1.0]]), log_std=jnp.array([[-0.7, 0.2]]))
+    squashed = distributions.TanhGaussian(
+        gaussian=gaussian, center=jnp.array([1.0, 0.0]), half_range=jnp.array([0.5, 2.0])
+    )
+    noise = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
+    unit, log_prob = distributions.sample_unit(squashed, jnp.asarray(noise))
+    raw = np.asarray(gaussian.mean, np.float64) + np.exp(np.asarray(gaussian.log_std, np.float64)) * noise
+    expected = scipy.stats.norm.logpdf(raw, gaussian.mean, np.exp(gaussian.log_std)) - np.log1p(-(np.tanh(raw) ** 2))
+    np.testing.assert_allclose(log_prob, expected.sum(axis=-1), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        distributions.sample(squashed, jnp.asarray(noise)),
+        [1.0, 0.0] + np.array([0.5, 2.0]) * np.asarray(unit),
+        rtol=1e-6,
+    )
+    far = distributions.sample_unit(squashed, jnp.full((1, 2), 40.0))[1]
+    assert np.isfinite(far).all()

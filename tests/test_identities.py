@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax import methods, on_policy, reward_models, runner
+from ccil_jax import methods, on_policy, reward_models, runner, running_statistics
 from ccil_jax.config import Config
 from ccil_jax.on_policy import AgentState
 from ccil_jax.types import ExpertData, Metrics
@@ -119,3 +119,28 @@ def test_gail_with_the_tasks_reward_in_the_discriminators_place_is_trpo(monkeypa
     monkeypatch.setattr(reward_models, "discriminator", lambda *_: reward_models.task())
     assert_equal(train(walk_config(method="gail"), reward="task"), trpo)
     assert not same_bits(gail()[0].actor, trpo[0].actor)
+
+
+@pytest.mark.parametrize(("name", "choice"), [("pid_il", "pid"), ("cpo_il", "optimal")])
+def test_a_row_with_its_own_multiplier_is_ccil_with_that_choice(name: str, choice: str) -> None:
+    row = train(walk_config(method=name))
+    assert_equal(row, train(walk_config(method="ccil", multiplier_update=choice)))
+    assert not same_bits(row[0].actor, ccil()[0].actor)
+    assert np.asarray(row[1]["cost_weight"]).max() > 0
+
+
+def test_re_evaluated_advantages_are_the_stale_ones_where_nothing_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With frozen networks and statistics both are the same; with learning they differ, but only in the multiplier."""
+
+    def malm(reward: str, **changes: Any) -> Run:
+        return train(walk_config(method="malm", **changes), reward)
+
+    stale, fresh = malm("the row's"), malm("the row's", outer_advantage="re-evaluated")
+    gradients = [np.asarray(run[1]["meta_gradient"]) for run in (stale, fresh)]
+    assert (gradients[0][:, 0] != gradients[1][:, 0]).all()
+    for name in ("kl", "surrogate", "imitation_reward"):  # of the first iteration, before the multiplier is used
+        assert same_bits(stale[1][name][:, 0], fresh[1][name][:, 0])
+    monkeypatch.setattr(running_statistics, "normalize", lambda statistics, samples: samples)
+    frozen_networks = {"critic_learning_rate": 0.0, "discriminator_learning_rate": 0.0}
+    stale, fresh = (malm("frozen", **frozen_networks, outer_advantage=kind) for kind in ("stale", "re-evaluated"))
+    np.testing.assert_allclose(stale[1]["meta_gradient"], fresh[1]["meta_gradient"], rtol=1e-4, atol=1e-6)

@@ -156,8 +156,30 @@ def test_numpy_policy_is_the_learnt_policy() -> None:
         actor = Actor(policy_params=policy.init(jax.random.key(1)), obs_statistics=statistics)
         obs = random.normal(2, 10, (20, 5)).astype(np.float32)
         expected = act(policy.apply, actor, jnp.asarray(obs), jnp.zeros((20, 3)))
-        mode = np.stack([NumpyPolicy(config, actor).mode(x) for x in obs])
-        np.testing.assert_allclose(mode, expected, atol=1e-5)
+        numpy_policy = NumpyPolicy(config, actor, -np.ones(3), np.ones(3))
+        np.testing.assert_allclose(np.stack([numpy_policy.mode(x) for x in obs]), expected, atol=1e-5)
+
+
+def test_the_numpy_policy_of_iq_learn_is_the_jax_policy() -> None:
+    import jax
+    import jax.numpy as jnp
+
+    import envs
+    from ccil_jax import networks
+    from ccil_jax.rollout import Actor, act
+    from experiments.original import NumpyPolicy
+
+    env = envs.make("Hopper")
+    config = Config(method="iq_learn", hidden_sizes=(16, 8), activation="relu")
+    policy = networks.make_squashed_policy(config, env)
+    actor = Actor(policy_params=policy.init(jax.random.key(0)), obs_statistics=None)
+    obs = np.random.default_rng(0).normal(0, 10, (20, 11)).astype(np.float32)
+    noise = np.stack([np.random.default_rng(i).standard_normal(3) for i in range(20)]).astype(np.float32)
+    numpy_policy = NumpyPolicy(config, actor, env.action_low, env.action_high)
+    sampled = np.stack([numpy_policy.sample(x, np.random.default_rng(i)) for i, x in enumerate(obs)])
+    expected = act(policy.apply, actor, jnp.asarray(obs), jnp.asarray(noise))
+    np.testing.assert_allclose(sampled, expected, atol=1e-4)
+    assert {"action_center", "action_half_range", "obs_clip"} <= numpy_policy.arrays().keys()
 
 
 @pytest.mark.parametrize("task", ["Swimmer", "HalfCheetah", "Hopper", "Walker2d", "Ant", "Humanoid"])

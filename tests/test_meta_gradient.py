@@ -44,7 +44,7 @@ class Learner:
         @jax.jit
         def step_derivative(taken: PolicyStep, multiplier: jax.Array) -> jax.Array:
             def replay(multiplier: jax.Array) -> jax.Array:
-                weights = constraint.combine(multiplier, taken.cost_gap, taken.directions.gram)
+                weights = constraint.combine(multiplier, taken.step_gap, taken.directions.gram)
                 params = ravel_pytree(taken.policy_params)[0]
                 return trust_region.propose(params, taken.directions, weights, config.max_kl, taken.fraction)
 
@@ -327,18 +327,37 @@ def numbered(size: int) -> Batch:
 
 
 def test_the_split_is_a_random_partition_with_rows_kept_together() -> None:
-    held_out, training = policy_step.split(numbered(20), 6, jax.random.key(0))
+    held_out, training = policy_step.split(
+        numbered(20), 6, policy_step.random_order(Config(batch_size=20, num_envs=4), jax.random.key(0))
+    )
     assert held_out.cost.shape == (6,)
     assert training.cost.shape == (14,)
     np.testing.assert_array_equal(np.sort(np.concatenate([held_out.cost, training.cost])), np.arange(20))
     for part in (held_out, training):
         for column in jax.tree.leaves(part):
             np.testing.assert_array_equal(column.reshape(len(part.cost), -1)[:, 0], part.cost)
-    other, _ = policy_step.split(numbered(20), 6, jax.random.key(1))
+    other, _ = policy_step.split(
+        numbered(20), 6, policy_step.random_order(Config(batch_size=20, num_envs=4), jax.random.key(1))
+    )
     assert not np.array_equal(held_out.cost, other.cost)
 
 
 def test_without_held_out_samples_the_batch_stays_as_it_is() -> None:
-    held_out, training = policy_step.split(numbered(20), 0, jax.random.key(0))
+    held_out, training = policy_step.split(numbered(20), 0, jnp.arange(20))
     assert held_out.cost.shape == (0,)
     assert same_bits(training, numbered(20))
+
+
+def test_a_split_by_trajectory_holds_out_whole_simulations() -> None:
+    """Of 5 simulations with 4 steps each 0.5 are held out: 2, with all their steps, and others under another key."""
+    config = Config(method="malm", batch_size=20, num_envs=5, held_out_unit="trajectory", held_out_fraction=0.5)
+    assert config.num_held_out == 8
+    chosen = set()
+    for seed in range(20):
+        order = policy_step.random_order(config, jax.random.key(seed))
+        held_out, training = policy_step.split(numbered(20), config.num_held_out, order)
+        simulations = np.asarray(held_out.cost).astype(int) % 5  # samples are [T, N] in C order
+        assert np.bincount(simulations, minlength=5).tolist().count(4) == 2
+        assert not set(simulations) & set(np.asarray(training.cost).astype(int) % 5)
+        chosen.add(frozenset(simulations.tolist()))
+    assert len(chosen) > 4

@@ -247,3 +247,29 @@ def test_held_out_samples_are_never_trained_on() -> None:
     (_, one, metrics), (_, two, others) = (advance(start(), steps, e, jax.random.key(0)) for e in (expert, other))
     assert same_bits(one, two)
     assert metrics["discriminator_accuracy_held_out"] != others["discriminator_accuracy_held_out"]
+
+
+def test_spectral_normalisation_divides_by_the_largest_singular_value() -> None:
+    rng = np.random.default_rng(0)
+    for shape in ((5, 100), (100, 100), (100, 1)):
+        matrix = rng.normal(size=shape).astype(np.float32)
+        found = reward_models.largest_singular_value(jnp.asarray(matrix), 200)
+        np.testing.assert_allclose(found, np.linalg.norm(matrix, 2), rtol=1e-4)
+        coarse = reward_models.largest_singular_value(jnp.asarray(matrix))
+        np.testing.assert_allclose(coarse, np.linalg.norm(matrix, 2), rtol=0.05)
+    # Its derivative is the outer product of the leading singular vectors.
+    u, s, v = np.linalg.svd(matrix[:, :1] @ np.ones((1, 3), np.float32))
+    slope = jax.grad(reward_models.largest_singular_value)(jnp.asarray(s[0] * np.outer(u[:, 0], v[0])))
+    np.testing.assert_allclose(slope, np.outer(u[:, 0], v[0]), atol=1e-4)
+
+
+def test_a_spectrally_normalised_network_is_lipschitz() -> None:
+    config = Config(hidden_sizes=(16, 16))
+    plain = networks.make_scalar(config, 4)
+    network = reward_models.spectrally_normalized(plain)
+    params = jax.tree.map(lambda leaf: 5 * leaf, network.init(jax.random.key(0)))
+    inputs = jax.random.normal(jax.random.key(1), (200, 4))
+    slopes = jnp.linalg.norm(jax.vmap(jax.grad(lambda x: network.apply(params, x)))(inputs), axis=-1)
+    steep = jnp.linalg.norm(jax.vmap(jax.grad(lambda x: plain.apply(params, x)))(inputs), axis=-1)
+    assert slopes.max() <= 1.05
+    assert steep.max() > 2

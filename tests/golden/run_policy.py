@@ -22,17 +22,24 @@ ACTIVATIONS: dict[str, Any] = {
     "swish": lambda x: x / (1 + np.exp(-x)),
 }
 
+LOG_STD_RANGE = (-5.0, 2.0)  # of squashed policies (IQ-Learn)
+
 
 def act(policy: dict[str, np.ndarray], facts: dict[str, Any], obs: np.ndarray, random: Any) -> np.ndarray:
     """An action drawn from one seed's policy, or its mean if it was evaluated so."""
-    x = np.clip((obs - policy["obs_mean"]) / policy["obs_std"], -facts["obs_clip"], facts["obs_clip"])
+    x = np.clip((obs - policy["obs_mean"]) / policy["obs_std"], -policy["obs_clip"], policy["obs_clip"])
     num_layers = sum(name.startswith("kernel_") for name in policy)
     for layer in range(num_layers):
         x = x @ policy[f"kernel_{layer}"] + policy[f"bias_{layer}"]
         if layer < num_layers - 1:
             x = ACTIVATIONS[facts["activation"]](x)
-    noise = 0.0 if facts["deterministic"] else policy["action_std"] * random.standard_normal(len(policy["action_std"]))
-    return x + noise
+    squashed = "action_half_range" in policy
+    noise = random.standard_normal(len(x) // 2 if squashed else len(x)) * (not facts["deterministic"])
+    if not squashed:
+        return x + policy["action_std"] * noise
+    mean, spread = np.split(x, 2)
+    log_std = LOG_STD_RANGE[0] + (LOG_STD_RANGE[1] - LOG_STD_RANGE[0]) * (np.tanh(spread) + 1) / 2
+    return policy["action_center"] + policy["action_half_range"] * np.tanh(mean + np.exp(log_std) * noise)
 
 
 def run_episode(

@@ -1,0 +1,90 @@
+"""Behaviour cloning on demonstrations whose best policy is known."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ccil_jax import behavior_cloning, runner
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.running_statistics import normalize
+from tests.probe_envs import Walk, numpy_policy, quick_compilation, same_bits, walk_config, walk_demonstrations
+
+SLOPE, STD = np.array([0.5, -0.3]), 0.2
+
+
+def linear_expert(num_steps: int) -> Demonstrations:
+    """Actions drawn from N(0.1 + SLOPE . obs, STD^2), in one long episode."""
+    rng = np.random.default_rng(0)
+    obs = rng.normal(size=(num_steps, 2))
+    actions = 0.1 + obs @ SLOPE[:, None] + STD * rng.normal(size=(num_steps, 1))
+    return dataclasses.replace(
+        walk_demonstrations(),
+        obs=obs.astype(np.float32),
+        actions=actions.astype(np.float32),
+        costs=np.zeros(num_steps, np.float32),
+        terminated=np.zeros(num_steps, bool),
+        truncated=np.arange(num_steps) == num_steps - 1,
+        episode_ends=np.array([num_steps]),
+    )
+
+
+def clone(demonstrations: Demonstrations, num_seeds: int = 1, **changes: Any) -> runner.Result:
+    config = walk_config(method="bc", hidden_sizes=(16,), critic_minibatch_size=32, **changes)
+    return runner.train(config, Walk(), demonstrations, num_seeds=num_seeds)
+
+
+def test_it_finds_the_mean_and_the_deviation_of_a_gaussian_expert() -> None:
+    demonstrations = linear_expert(4000)
+    result = clone(demonstrations, bc_epochs=40, actor_learning_rate=3e-3)
+    actor = jax.tree.map(lambda leaf: leaf[0], result.agent)
+    mean, log_std = numpy_policy(actor.policy_params, normalize(actor.obs_statistics, jnp.asarray(demonstrations.obs)))
+    truth = 0.1 + demonstrations.obs @ SLOPE
+    common = np.abs(demonstrations.obs).max(axis=1) < 2
+    assert np.sqrt(np.mean((mean[:, 0] - truth)[common] ** 2)) < 0.04
+    np.testing.assert_allclose(np.exp(log_std), STD, rtol=0.05)
+    entropy = 0.5 * np.log(2 * np.pi * np.e * STD**2)  # the least loss that there is
+    np.testing.assert_allclose(result.metrics["held_out_loss"].min(), entropy, atol=0.1)
+    assert result.env_steps == 0
+    assert not result.metrics["env_steps"].any()
+
+
+def test_what_acts_was_best_on_the_held_out_steps() -> None:
+    """30 noisy samples are learnt by heart: the held-out loss turns, and the parameters of its lowest point stay."""
+    demonstrations = linear_expert(30)
+    env = Walk()
+    config = runner.resolve(
+        walk_config(method="bc", hidden_sizes=(32,), critic_minibatch_size=9, actor_learning_rate=0.02),
+        env,
+        demonstrations,
+    )
+    expert = runner.expert_data(demonstrations)
+    agent = behavior_cloning.make(config, env, expert)
+    state, step, losses, seen = agent.init(jax.random.key(1)), jax.jit(agent.step), [], []
+    for _ in range(60):
+        state, metrics = step(state)
+        losses.append(float(metrics["held_out_loss"]))
+        seen.append(state.params)
+    best = int(np.argmin(losses))
+    assert best < 50 and losses[-1] > losses[best] + 0.2
+    assert same_bits(state.actor.policy_params, seen[best])
+    assert float(state.held_out_loss) == losses[best]
+
+
+def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
+    def train(directory: Path | None = None, **options: Any) -> runner.Result:
+        config = walk_config(method="bc", bc_epochs=20)
+        demonstrations = walk_demonstrations()
+        with quick_compilation():
+            return runner.train(config, Walk(), demonstrations, num_seeds=2, checkpoint_dir=directory, **options)
+
+    whole = train()
+    train(tmp_path, stop_after=10)
+    resumed = train(tmp_path, resume=True)
+    assert same_bits(resumed.state, whole.state)
+    assert all(same_bits(resumed.metrics[name], rows) for name, rows in whole.metrics.items())
+    loaded = runner.load(walk_config(method="bc"), Walk(), tmp_path, 2)
+    assert same_bits(loaded.agent, whole.agent)

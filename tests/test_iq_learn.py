@@ -1,0 +1,116 @@
+"""IQ-Learn: its loss by hand, its expert data, what its critic and policy converge to, and its state on disk."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ccil_jax import iq_learn, networks, runner
+from ccil_jax.config import Config
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.iq_learn import Minibatch
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+
+
+def iq_config(**changes: Any) -> Config:
+    settings = {"method": "iq_learn", "generator_steps": 1, "replay_size": 64, "activation": "relu", "temperature": 0.1}
+    return walk_config(**{**settings, **changes})
+
+
+@pytest.mark.parametrize(
+    ("kind", "value_term"), [("value", (1.0 + 0.0 - 1.0 + 3.0) / 4), ("v0", 0.1 * (4.0 + 6.0) / 2)]
+)
+def test_the_loss_by_hand(kind: str, value_term: float) -> None:
+    """r = (1, 2, -1, 0): on the expert 1.5; mean r^2 = 6 / 4; alpha 0.5 makes its weight 1 / 2."""
+    q, target = jnp.array([2.0, 2.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 1.0, 1.0])
+    value = jnp.array([2.0, 0.0, 0.0, 4.0])
+    config = iq_config(value_loss=kind, gamma=0.9, chi2_coefficient=0.5)
+    found = iq_learn.loss(q, value, target, jnp.array([4.0, 6.0]), config)
+    np.testing.assert_allclose(found, value_term - 1.5 + 1.5 / 2, rtol=1e-6)
+
+
+def test_a_last_step_counts_only_where_the_task_ended() -> None:
+    """Three episodes end after steps 2, 4 and 5 (exclusive); the first by termination."""
+    demonstrations = Demonstrations(
+        obs=np.arange(5.0, dtype=np.float32)[:, None] * [[1, 1]],
+        actions=np.zeros((5, 1), np.float32),
+        rewards=None,
+        costs=np.zeros(5, np.float32),
+        terminated=np.array([0, 1, 0, 0, 0], bool),
+        truncated=np.array([0, 0, 0, 1, 1], bool),
+        episode_ends=np.array([2, 4, 5]),
+    )
+    found = runner.expert_transitions(demonstrations)
+    np.testing.assert_array_equal(found.obs[:, 0], [0, 1, 2])
+    np.testing.assert_array_equal(found.next_obs[[0, 2], 0], [1, 3])
+    np.testing.assert_array_equal(found.terminated, [0, 1, 0])
+    np.testing.assert_array_equal(found.initial_obs[:, 0], [0, 2, 4])
+
+
+def test_one_state_has_a_known_solution() -> None:
+    """A bandit: each step terminates, the expert always plays 0.5, the learner's steps are uniform.
+
+    With y = 0 the loss is mean(V) - mean_E r + mean(r^2) / 2 over both sources, r = Q. Away from the expert's action Q
+    is pressed below 0 by V, at it it is raised, and the policy settles where Q is highest.
+    """
+    env = Walk()
+    config = iq_config(hidden_sizes=(32, 32), critic_learning_rate=3e-3, actor_learning_rate=3e-3, temperature=0.01)
+    policy, critic = networks.make_squashed_policy(config, env), networks.make_scalar(config, 3)
+    update = iq_learn.updates(config, policy, critic, 1)
+    obs = jnp.zeros((128, 2))
+
+    def step(learner: iq_learn.Learner, key: jax.Array) -> tuple[iq_learn.Learner, Any]:
+        action_key, step_key = jax.random.split(key)
+        uniform = jax.random.uniform(action_key, (64, 1), minval=-1.0, maxval=1.0)
+        action = jnp.concatenate([jnp.full((64, 1), 0.5), uniform])
+        batch = Minibatch(obs=obs, action=action, next_obs=obs, terminated=jnp.ones(128), initial_obs=obs[:1])
+        return update.step(learner, batch, step_key)
+
+    start = update.init(jax.random.key(0))
+    learner, metrics = jax.jit(lambda keys: jax.lax.scan(step, start, keys))(jax.random.split(jax.random.key(1), 1500))
+    grid = jnp.linspace(-1, 1, 41)[:, None]
+    q = critic.apply(learner.critic_params, jnp.concatenate([jnp.zeros((41, 2)), grid], axis=-1))
+    assert abs(float(grid[jnp.argmax(q), 0]) - 0.5) <= 0.1
+    assert float(q[0]) < float(jnp.max(q)) - 0.3
+    played = policy.apply(learner.policy_params, obs[:1])
+    np.testing.assert_allclose(np.tanh(played.gaussian.mean), 0.5, atol=0.1)
+    assert all(np.isfinite(values).all() for values in metrics.values())
+
+
+def train(directory: Path | None = None, num_seeds: int = 2, **options: Any) -> runner.Result:
+    with quick_compilation():
+        return runner.train(
+            iq_config(env_steps=20 * 32, critic_minibatch_size=8),
+            Walk(),
+            walk_demonstrations(),
+            num_seeds=num_seeds,
+            checkpoint_dir=directory,
+            **options,
+        )
+
+
+@pytest.fixture(scope="module")
+def whole() -> runner.Result:
+    return train()
+
+
+def test_a_stopped_and_resumed_run_is_the_unbroken_run(whole: runner.Result, tmp_path: Path) -> None:
+    train(tmp_path, stop_after=10)
+    resumed = train(tmp_path, resume=True)
+    assert same_bits(resumed.state, whole.state)
+    assert all(same_bits(resumed.metrics[name], rows) for name, rows in whole.metrics.items())
+    loaded = runner.load(iq_config(env_steps=20 * 32), Walk(), tmp_path, 2)
+    assert same_bits(loaded.agent, whole.agent)
+
+
+def test_it_learns_from_every_step(whole: runner.Result) -> None:
+    """20 iterations of 32 steps: as many updates, and the ring holds the last 64 true transitions."""
+    assert (np.asarray(whole.state.learner.policy_optimizer[0].count) == 20 * 32).all()
+    ring = jax.tree.map(lambda leaf: np.asarray(leaf[0]), whole.state.replay)
+    assert ring.num_added == 20 * 32
+    assert np.abs(ring.action).max() <= 1  # squashed into the range
+    assert all(np.isfinite(rows).all() for rows in whole.metrics.values())
+    assert not same_bits(ring, jax.tree.map(lambda leaf: np.asarray(leaf[1]), whole.state.replay))
