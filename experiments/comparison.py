@@ -32,17 +32,21 @@ def row(variant: Variant) -> Row:
         content[f"{name}_per_seed"] = values
     metrics = run_folder.read_metrics(variant.plan.folder)
     limit = summary["cost_limit"] if summary["expert_cost"] is None else summary["expert_cost"]
-    content |= multiplier_path(metrics["multiplier"], metrics["episode_cost"], limit)
+    content |= multiplier_path(metrics, limit)
     rate, num_runs = summary["env_steps_per_second"], summary["runs_in_program"]
     return content | {"env_steps_per_second": rate, "runs_in_program": num_runs}
 
 
-def multiplier_path(multiplier: np.ndarray, episode_cost: np.ndarray, limit: float | None) -> Row:
-    """Whether the multiplier wound up; arrays are [num_iterations, num_seeds], results means over seeds.
+def multiplier_path(metrics: Mapping[str, np.ndarray], limit: float | None) -> Row:
+    """Whether the multiplier wound up; metrics are [num_iterations, num_seeds], results means over seeds.
 
     `final_multiplier` is its mean over the last tenth of the iterations, `windup` the share of all iterations in which
-    the cost was already below the limit while the multiplier was still above its final value.
+    the cost was already below the limit while the multiplier was still above its final value. Methods without a
+    multiplier get None.
     """
+    if "multiplier" not in metrics:
+        return dict.fromkeys(("max_multiplier", "final_multiplier", "windup"))
+    multiplier, episode_cost = metrics["multiplier"], metrics["episode_cost"]
     last = max(1, round(_FINAL * len(multiplier)))
     final = multiplier[-last:].mean(axis=0)
     above = (episode_cost < (np.inf if limit is None else limit)) & (multiplier > final)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccil_jax.config import Config, validate
+from ccil_jax.config import METHOD_NAMES, Config, validate
 from experiments import ablations, comparison, comparison_figures, variants
 from experiments.ablations import QUESTIONS
 from experiments.comparison import Row, multiplier_path
@@ -25,7 +25,7 @@ def test_every_answer_is_a_configuration(name: str) -> None:
 def test_the_first_answer_is_the_default(tmp_path: Path) -> None:
     answers = ablations.ask(list(QUESTIONS), SHARED, tmp_path)
     baselines = {answers[name, next(iter(question.answers))].name for name, question in QUESTIONS.items()}
-    assert baselines == {"malm", "cvag"}
+    assert baselines <= set(METHOD_NAMES)  # no change in their names
 
 
 def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: Path) -> None:
@@ -41,9 +41,9 @@ def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: P
         *(f"malm,initial_multiplier={start}" for start in (1.0, 10.0)),
     } in names
     assert sum(map(len, names)) == len(different)
-    # As few as there are static configurations, and one more for the baseline's speed.
+    # As few as there are static configurations, and at most one more for each baseline's speed.
     static = {variants.static_part(variant.plan.config) for variant in different.values()}
-    assert len(programs) == len(static) + 1
+    assert len(static) < len(programs) <= len(static) + sum(variant.alone for variant in different.values())
 
 
 def test_a_program_is_the_same_to_its_worker(tmp_path: Path) -> None:
@@ -65,10 +65,12 @@ def test_the_path_of_a_multiplier() -> None:
     wound = np.array([0.0] * 4 + [4.0] * 4 + [2.0] * 10 + [1.0, 1.0])
     steady = np.full(20, 0.5)
     cost = np.array([30.0] * 6 + [20.0] * 14)
-    path = multiplier_path(np.stack([wound, steady], 1), np.stack([cost, cost], 1), limit=25.0)
+    metrics = {"multiplier": np.stack([wound, steady], 1), "episode_cost": np.stack([cost, cost], 1)}
+    path = multiplier_path(metrics, limit=25.0)
     assert path["max_multiplier"] == (4.0 + 0.5) / 2
     assert path["final_multiplier"] == (1.0 + 0.5) / 2
     assert path["windup"] == pytest.approx((2 + 10) / 20 / 2)  # below the limit from 6 on, above 1 up to 17
+    assert set(multiplier_path({}, limit=25.0).values()) == {None}
 
 
 def row(question: str, answer: str, level: float, rate: float | None, num_runs: int = 3) -> Row:

@@ -14,6 +14,7 @@ import pytest
 from ccil_jax import runner
 from ccil_jax.config import Config, ConfigError
 from ccil_jax.runner import Result
+from experiments import devices
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 NUM_SEEDS = 2
@@ -76,6 +77,14 @@ def test_stopped_and_resumed_together(results: list[Result], tmp_path: Path) -> 
         assert same_bits(loaded.agent, result.agent)
 
 
+@pytest.mark.parametrize(
+    ("num_runs", "num_cores", "several", "expected"),
+    [(8, 4, False, 4), (3, 4, False, 3), (8, 1, False, 1), (8, 1, True, 2), (3, 1, True, 3), (1, 4, True, 1)],
+)
+def test_devices_share_runs_evenly(num_runs: int, num_cores: int, several: bool, expected: int) -> None:
+    assert devices.num_cpu_devices(num_runs, num_cores, several=several) == expected
+
+
 def test_only_traced_fields_may_differ() -> None:
     with pytest.raises(ConfigError, match="hidden_sizes"):
         runner.train_runs([walk_config(method="trpo"), walk_config(method="trpo", hidden_sizes=(5,))], Walk())
@@ -91,16 +100,16 @@ def test_fields_that_agree_stay_numbers() -> None:
 
 
 ON_FOUR_DEVICES = """
-import json, jax
+import json, sys, jax
 from ccil_jax import runner
 from ccil_jax.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 env, demonstrations = Walk(), walk_demonstrations()
 expert, keys = runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 2)
-rates = (0.05, 0.01, 0.2)
 configs = [
-    runner.resolve(walk_config(method="malm", multiplier_learning_rate=rate), env, demonstrations) for rate in rates
+    runner.resolve(walk_config(method=sys.argv[1], critic_learning_rate=rate), env, demonstrations)
+    for rate in (0.01, 0.02, 0.05)
 ]
 shared, varied = runner.join(configs, num_seeds=2)
 alone = compile_program(configs[0], env, expert, 2, one_by_one=True)
@@ -119,11 +128,12 @@ print(json.dumps({
 """
 
 
-def test_devices_share_runs_without_a_word() -> None:
+@pytest.mark.parametrize("method", ["trpo", pytest.param("malm", marks=pytest.mark.slow)])
+def test_devices_share_runs_without_a_word(method: str) -> None:
     """Four CPU devices: nothing travels between them; taken in turn, a run has the same bits in any company."""
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "PJRT_NPROC": "16"}
     environment["PYTHONPATH"] = str(Path(__file__).parent.parent)
-    command = [sys.executable, "-c", ON_FOUR_DEVICES]
+    command = [sys.executable, "-c", ON_FOUR_DEVICES, method]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == {"devices": [2, 3, 4], "same": [True, False, False], "collectives": []}
