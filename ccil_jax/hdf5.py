@@ -47,7 +47,14 @@ def run_child(arguments: Sequence[str]) -> tuple[int, str]:
     }
     command = [sys.executable, "-P", "-m", "ccil_jax.hdf5_child", *arguments]
     done = subprocess.run(
-        command, env=settings, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace",
-        timeout=TIMEOUT, check=False,
-    )  # fmt: skip
+        command,
+        cwd=Path(arguments[1]).parent,  # an empty folder: no module is found in the working directory
+        env=settings,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=TIMEOUT,
+        check=False,
+    )
     return done.returncode, done.stderr.strip().rpartition("\n")[2]

@@ -212,7 +212,8 @@ def run_named() -> list[dict[str, Any]]:
             folder = Path(f"{family} {number}".replace(" ", "_"))
             folder.mkdir()
             build(folder / "bad")
-            stderr, status = io.StringIO(), []
+            stderr = io.StringIO()
+            status: list[Any] = []
 
             def act(folder: Path = folder, status: list[Any] = status) -> None:
                 try:

@@ -55,3 +55,28 @@ def test_mutated_files_are_refused_or_read() -> None:
 @pytest.mark.slow
 def test_ten_thousand_mutated_files() -> None:
     print(hostile_files("--mutations", "10000", "--seed", "1"))
+
+
+def test_the_harness_sees_what_it_looks_for() -> None:
+    """Real execution, an endless loop, another error and an allocation beyond the limit are told from a refusal."""
+    code = """
+import os, pickle, time
+from pathlib import Path
+import numpy as np
+from ccil_jax.demonstrations import DemonstrationsError
+from tests import hostile_builders, hostile_files as h
+
+def refuse(): raise DemonstrationsError("no")
+h.SECONDS = 0.2
+with h.confined():
+    hostile_builders.LEGACY["os.mkdir"][0](Path("payload.npz"))
+    acts = [lambda: np.load("payload.npz", allow_pickle=True)["obs"], lambda: os.system("true"), lambda: time.sleep(9),
+            lambda: [][0], lambda: np.ones(2**33), refuse, lambda: None]
+    print([h.outcome(act).partition(":")[0] for act in acts])
+"""
+    settings = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=settings, capture_output=True, text=True, check=True
+    )
+    expected = ["executed", "executed", "hung", "IndexError", "MemoryError", "refused", "read"]
+    assert done.stdout.strip() == str(expected)
