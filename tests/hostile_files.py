@@ -178,6 +178,7 @@ def mutated_files(family: str, seed: int) -> Iterator[Path]:
     """Endlessly many damaged files, each in place of the one before."""
     path = Path("sound") if family == "Minari" else Path("sound.npz")
     SOUND[family](path)
+    load_demonstrations(path)  # what is not sound to begin with would prove nothing
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     contents = [file.read_bytes() for file in files]
     rng = np.random.default_rng([seed, *family.encode()])
