@@ -20,13 +20,14 @@ from ccil_jax import npz
 
 KEYS = ("obs", "acs")
 OPTIONAL_KEYS = ("rews", "costs", "accucost")
-MAX_OPCODES = 2_000_000  # seconds of parsing; an array costs about 20, a boxed number about 8
+MAX_OPCODES = 1_000_000  # a second or two of parsing; an array takes about 20, a boxed number about 8
 _OPCODES = frozenset(
     "PROTO FRAME STOP MARK MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD "
     "NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT EMPTY_LIST APPEND APPENDS "
     "EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINBYTES SHORT_BINBYTES BINBYTES8 BINUNICODE SHORT_BINUNICODE "
     "BINSTRING SHORT_BINSTRING".split()
 )
+_REFUSED = "refused because it could execute code; record it anew"
 _DTYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
 _DAMAGE = (
     pickle.UnpicklingError,
@@ -78,7 +79,7 @@ def unpickle(content: bytes, shape: tuple[int, ...], where: str) -> np.ndarray:
             return budget.ragged(array.values)
         return budget.numbers(array.values).reshape(shape)
     except _UnsafeError as error:
-        raise npz.ArchiveError(f"{where} {error}, refused because it could execute code; record it anew") from None
+        raise npz.ArchiveError(f"{where} {error}") from None
     except _DAMAGE:
         raise npz.ArchiveError(f"{where} is truncated or damaged, or no array of arrays; record it anew") from None
 
@@ -88,9 +89,9 @@ def _check_opcodes(content: bytes) -> None:
     count = 0
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
         if opcode.name not in _OPCODES:
-            raise _UnsafeError(f"holds a pickle with opcode {opcode.name}")
+            raise _UnsafeError(f"holds a pickle with opcode {opcode.name}, {_REFUSED}")
         if count > MAX_OPCODES:
-            raise ValueError("too many opcodes")
+            raise _UnsafeError(f"holds a pickle of more than {MAX_OPCODES} opcodes; save arrays, not lists of numbers")
         size = argument if isinstance(argument, int) else 0
         if opcode.name in ("BINPUT", "LONG_BINPUT") and size > count:
             raise ValueError("the unpickler would make a memo of this size")
@@ -187,7 +188,7 @@ class _Unpickler(pickle.Unpickler):
             ("_codecs", "encode"): self._encode,
         }
         if (module, name) not in names:
-            raise _UnsafeError(f"holds a pickle that names {f'{module}.{name}'[:80]!a}")
+            raise _UnsafeError(f"holds a pickle that names {f'{module}.{name}'[:80]!a}, {_REFUSED}")
         return names[module, name]
 
     def _encode(self, text: str, encoding: str) -> bytes:  # how Python 3 writes bytes that Python 2 can read
