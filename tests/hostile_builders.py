@@ -318,7 +318,7 @@ LEGACY: dict[str, Case] = {
     "laughs": (pickled(object_array(b"](" + _laughs(200, 6) + b"Ne")), _DAMAGED),
     "list in itself": (_with(b"]q\x01h\x01a"), _DAMAGED),
     "rows named often": (_with(b"](" + vector(b"K\x01\x85") + b"q\x01" + b"h\x01" * 200_000 + b"e"), "trajectory"),
-    "too many opcodes": (_with(b"](" + b"N" * 1_100_000 + b"e"), "more than 1000000 opcodes"),
+    "too many opcodes": (_with(b"](" + b"N" * 3_100_000 + b"e"), "past 3000000 opcodes of pickles"),
     "deep": (_with(b"](" * 100_000 + b"e" * 100_000), _DAMAGED),
     "none": (_holding(None), _DAMAGED),
     "text": (_holding("x" * 8), _DAMAGED),
