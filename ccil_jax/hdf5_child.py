@@ -61,9 +61,9 @@ def _groups(file: Any) -> Iterator[Any]:
     """The root, the episodes and their `infos`."""
     import h5py
 
-    yield file
     if len(file) > MAX_ENTRIES:
         raise RefusedError(f"holds {len(file)} entries, limit {MAX_ENTRIES}")
+    yield file
     for name in file:
         if re.fullmatch(r"episode_\d{1,9}", name):
             _check_link(file, name, name)

@@ -20,13 +20,14 @@ from ccil_jax import npz
 
 KEYS = ("obs", "acs")
 OPTIONAL_KEYS = ("rews", "costs", "accucost")
-MAX_OPCODES = 2_000_000  # seconds of parsing; an array costs about 20, a boxed number about 8
+MAX_OPCODES = 3_000_000  # of a file: seconds of parsing; an array takes about 20, a boxed number 1 to 8
 _OPCODES = frozenset(
     "PROTO FRAME STOP MARK MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD "
     "NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT EMPTY_LIST APPEND APPENDS "
     "EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 BINBYTES SHORT_BINBYTES BINBYTES8 BINUNICODE SHORT_BINUNICODE "
     "BINSTRING SHORT_BINSTRING".split()
 )
+_REFUSED = "refused because it could execute code; record it anew"
 _DTYPE = re.compile(r"b1|[iu][1248]|f[248]|O8?")
 _DAMAGE = (
     pickle.UnpicklingError,
@@ -50,52 +51,71 @@ def read(path: Path) -> dict[str, list[np.ndarray]]:
     """For `KEYS`, and for `OPTIONAL_KEYS` where present, one numeric array per trajectory. Raises `ArchiveError`."""
     optional = frozenset(OPTIONAL_KEYS)
     remedy = "the keys are obs, acs, and costs or accucost"
-    arrays = npz.read(path, (*KEYS, *OPTIONAL_KEYS), optional=optional, remedy=remedy, read_objects=unpickle)
+    left = MAX_OPCODES
+
+    def read_objects(content: bytes, shape: tuple[int, ...], where: str) -> np.ndarray:
+        nonlocal left
+        array, opcodes = unpickle(content, shape, where, left)
+        left -= opcodes
+        return array
+
+    arrays = npz.read(path, (*KEYS, *OPTIONAL_KEYS), optional=optional, remedy=remedy, read_objects=read_objects)
     for key, array in arrays.items():
         if array.ndim == 0:
             raise npz.ArchiveError(f"{path}: '{key}' is one value, must be one array per trajectory; record it again")
     return {key: list(array) for key, array in arrays.items()}
 
 
-def unpickle(content: bytes, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """The object array in a pickle: a numeric array, or one of object dtype [E] whose entries are numeric arrays.
+def unpickle(
+    content: bytes, shape: tuple[int, ...], where: str, max_opcodes: int = MAX_OPCODES
+) -> tuple[np.ndarray, int]:
+    """The object array in a pickle, and the opcodes that made it.
+
+    It is a numeric array, or one of object dtype [E] whose entries are numeric arrays.
 
     Args:
         content: The pickle; only its first object is looked at.
         shape: What the file's header declares.
         where: File and key, which begin the message.
+        max_opcodes: How long the pickle may be.
 
     Raises:
         ArchiveError: It is damaged, or holds or does anything else.
     """
     try:
-        _check_opcodes(content)
+        opcodes = _check_opcodes(content, max_opcodes)
         array = _Unpickler(content).load()
         if not isinstance(array, _Array) or array.shape != shape or not isinstance(array.values, list):
             raise ValueError("not the array that the header declares")
         budget = _Budget(2 * len(content))
         if len(shape) == 1 and any(isinstance(value, _Array | list | tuple) for value in array.values):
-            return budget.ragged(array.values)
-        return budget.numbers(array.values).reshape(shape)
+            return budget.ragged(array.values), opcodes
+        return budget.numbers(array.values).reshape(shape), opcodes
     except _UnsafeError as error:
-        raise npz.ArchiveError(f"{where} {error}, refused because it could execute code; record it anew") from None
+        raise npz.ArchiveError(f"{where} {error}") from None
     except _DAMAGE:
         raise npz.ArchiveError(f"{where} is truncated or damaged, or no array of arrays; record it anew") from None
 
 
-def _check_opcodes(content: bytes) -> None:
-    """Reads the program without running it: known opcodes, sizes that the file holds, a memo without gaps."""
+def _check_opcodes(content: bytes, limit: int) -> int:
+    """Reads the program without running it: known opcodes, sizes that the file holds, a memo without gaps.
+
+    Returns the number of opcodes.
+    """
     count = 0
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
         if opcode.name not in _OPCODES:
-            raise _UnsafeError(f"holds a pickle with opcode {opcode.name}")
-        if count > MAX_OPCODES:
-            raise ValueError("too many opcodes")
+            raise _UnsafeError(f"holds a pickle with opcode {opcode.name}, {_REFUSED}")
+        if count > limit:
+            raise _UnsafeError(
+                f"takes the file past {MAX_OPCODES} opcodes of pickles; save arrays, not lists of numbers"
+            )
         size = argument if isinstance(argument, int) else 0
         if opcode.name in ("BINPUT", "LONG_BINPUT") and size > count:
             raise ValueError("the unpickler would make a memo of this size")
         if opcode.name == "FRAME" and size > len(content):
             raise ValueError("the frame is larger than the file")
+    return count
 
 
 class _Dtype:
@@ -187,7 +207,7 @@ class _Unpickler(pickle.Unpickler):
             ("_codecs", "encode"): self._encode,
         }
         if (module, name) not in names:
-            raise _UnsafeError(f"holds a pickle that names {f'{module}.{name}'[:80]!a}")
+            raise _UnsafeError(f"holds a pickle that names {f'{module}.{name}'[:80]!a}, {_REFUSED}")
         return names[module, name]
 
     def _encode(self, text: str, encoding: str) -> bytes:  # how Python 3 writes bytes that Python 2 can read

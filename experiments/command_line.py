@@ -16,6 +16,8 @@ from typing import Any, NoReturn
 from ccil_jax.config import ConfigError
 from ccil_jax.demonstrations import DemonstrationsError
 
+MAX_ERROR = 1000  # characters of an error message, which may quote a file
+
 
 class UsageError(ValueError):
     """Wrong input. The message is one line that names the option or file and the remedy."""
@@ -47,6 +49,8 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Ends the program with exit status 2 and one line on stderr."""
         line = " ".join(message.split()).removeprefix("argument ")
+        line = "".join(c if c.isprintable() else "?" for c in line)  # text from a file may not steer the terminal
+        line = line if len(line) <= MAX_ERROR else f"{line[:MAX_ERROR]}..."
         self.exit(2, f"{self.prog}: error: {line}\n")
 
 

@@ -153,6 +153,10 @@ NPZ: dict[str, Case] = {  # beside those of tests/test_npz.py and tests/test_dem
     "metadata of numbers": (_own(metadata=np.zeros(500_000)), "'metadata' is not a JSON object"),
     "metadata long": (_own(metadata=np.array('{"x": "' + "x" * 600_000 + '"}')), "'metadata' is not a JSON object"),
     "metadata of many digits": (_own(metadata=np.array('{"x": ' + "9" * 10_000 + "}")), "'metadata' is not a JSON"),
+    "task that steers the terminal": (
+        _own(metadata=np.array('{"task": "\\u001b[2J\\n' + "x" * 9000 + '"}')),
+        "recorded on task",
+    ),
     "text of no width": (_wide_metadata, "'metadata' is not a JSON object"),
     "structured": (_own(obs=np.zeros((N, 8), [("x", "f4")])), "'obs' has dtype"),
     "objects in a structure": (_own(obs=np.zeros((N, 8), [("x", "O")])), "'obs' holds pickled objects"),
@@ -314,7 +318,7 @@ LEGACY: dict[str, Case] = {
     "laughs": (pickled(object_array(b"](" + _laughs(200, 6) + b"Ne")), _DAMAGED),
     "list in itself": (_with(b"]q\x01h\x01a"), _DAMAGED),
     "rows named often": (_with(b"](" + vector(b"K\x01\x85") + b"q\x01" + b"h\x01" * 200_000 + b"e"), "trajectory"),
-    "too many opcodes": (_with(b"](" + b"N" * 2_100_000 + b"e"), _DAMAGED),
+    "too many opcodes": (_with(b"](" + b"N" * 3_100_000 + b"e"), "past 3000000 opcodes of pickles"),
     "deep": (_with(b"](" * 100_000 + b"e" * 100_000), _DAMAGED),
     "none": (_holding(None), _DAMAGED),
     "text": (_holding("x" * 8), _DAMAGED),
@@ -392,6 +396,16 @@ def bomb(file: Any, name: str) -> None:
     """Zeros that unpack to twice the limit."""
     rows = 2 * LIMIT // 64
     file.create_dataset(name, (rows, 8), "f8", chunks=(rows // 8, 8), compression="gzip", data=np.zeros((rows, 8)))
+
+
+def compressed(filter_name: str) -> Callable[[Any, str], None]:
+    """Sound values in chunks, with every filter that is read."""
+
+    def build(file: Any, name: str) -> None:
+        settings: dict[str, Any] = {"compression": filter_name, "shuffle": True, "fletcher32": filter_name == "gzip"}
+        file.create_dataset(name, data=dsrl_arrays()[name], chunks=(4, 2), **settings)
+
+    return build
 
 
 def group(file: Any, name: str) -> None:
@@ -548,6 +562,6 @@ FAMILIES: Mapping[str, Mapping[str, Case]] = {"npz": NPZ, "legacy npz": LEGACY, 
 SOUND: Mapping[str, Callable[[Path], None]] = {
     "npz": _own(),
     "legacy npz": _legacy(),
-    "DSRL": _dsrl(),
+    "DSRL": _dsrl(observations=compressed("gzip"), actions=compressed("lzf")),
     "Minari": _minari(),
 }

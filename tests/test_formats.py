@@ -146,7 +146,16 @@ def test_a_pickle_of_python_2(tmp_path: Path) -> None:
     content = b"\x80\x02" + new + b"(K\x01K\x01\x85" + dtype(b"O8", b"|") + b"\x89](" + inner + b"etb."
     from ccil_jax import legacy_npz
 
-    np.testing.assert_array_equal(legacy_npz.unpickle(content, (1,), "x")[0], [2.5, -1.0])
+    np.testing.assert_array_equal(legacy_npz.unpickle(content, (1,), "x")[0][0], [2.5, -1.0])
+
+
+def test_all_pickles_of_a_file_share_one_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ccil_jax import legacy_npz
+
+    path = legacy(tmp_path / "expert.npz")
+    monkeypatch.setattr(legacy_npz, "MAX_OPCODES", 320)  # obs and acs take 153 each, rews 84
+    with pytest.raises(DemonstrationsError, match="'rews' takes the file past 320 opcodes of pickles"):
+        load_demonstrations(path)
 
 
 def test_dsrl(tmp_path: Path) -> None:
