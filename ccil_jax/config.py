@@ -282,8 +282,8 @@ def validate(config: Config) -> None:
         )
     if config.standardize_cost_advantage and (config.method == "cpo_il" or config.multiplier_update == "optimal"):
         raise ConfigError(
-            "--standardize_cost_advantage true: the optimal multiplier compares the surrogate of the cost with its gap, "
-            "so it must keep its unit; leave it out"
+            "--standardize_cost_advantage true: the optimal multiplier compares the cost's surrogate with its gap, so "
+            "it must keep its unit; leave it out"
         )
     if config.pid_smoothing >= 1:
         raise ConfigError(f"--pid_smoothing {config.pid_smoothing}: must be below 1, or no gap is ever felt")

@@ -22,6 +22,7 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOU
 
 # A file of the learner imports only from those before it. A new file needs a place here.
 ORDER = (
+    "tabular",
     "npz",
     "legacy_npz",
     "hdf5_child",
