@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,7 +15,7 @@ from experiments import figures
 from experiments.theorem1 import BETA, BETAS, BOUNDS, NUM_ROUNDS, Problem, Run
 
 BLUE, RED, GREEN = figures.COLORS[:3]
-DARK = {"color": "#22262b", "linewidth": 1.2, "linestyle": (0, (5, 3))}
+DARK: Any = {"color": "#22262b", "linewidth": 1.2, "linestyle": (0, (5, 3))}
 
 
 def draw(
