@@ -250,11 +250,11 @@ def run_cvag(problem: Problem, size: float = 0.01) -> tuple[Run, Solution]:
         policy = tabular.natural_step(
             process, policy, reward if within else -process.cost - BETA * np.log(policy), size
         )
-    within = np.array([row[1] for row in rows], float)
-    share = np.cumsum(within[NUM_ROUNDS // 2 :]) / np.arange(1, NUM_ROUNDS - NUM_ROUNDS // 2 + 1)
+    rewarded = np.array([row[1] for row in rows], float)
+    share = np.cumsum(rewarded[NUM_ROUNDS // 2 :]) / np.arange(1, NUM_ROUNDS - NUM_ROUNDS // 2 + 1)
     settled = tabular.saddle(process, problem.cheap, BETA / share[-1])
     window = 200
-    recent = np.convolve(within, np.ones(window) / window, mode="valid")
+    recent = np.convolve(rewarded, np.ones(window) / window, mode="valid")
     recent = np.concatenate([np.full(window - 1, np.nan), recent])
     with np.errstate(divide="ignore"):
         multiplier = (1 - recent) / recent
