@@ -75,6 +75,9 @@ class Config:
     critic_minibatch_size: int = _static(128, "samples per critic gradient step (authors)")
     standardize_cost_advantage: bool = _static(False, "also divide the cost advantage by its deviation")
     bootstrap_at_truncation: bool = _static(True, "use the critic's value at a time limit; false zeroes it (authors)")
+    max_skipped_updates: int = _static(
+        10, "a seed stops after so many iterations in a row that were not finite; each is taken back"
+    )
 
     gamma: float = _traced(0.995, "discount of reward and cost (Table 1)")
     gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation, of the reward (Table 1)")
@@ -182,6 +185,7 @@ def validate(config: Config) -> None:
         "line_search_steps",
         "critic_epochs",
         "critic_minibatch_size",
+        "max_skipped_updates",
     ):
         if getattr(config, name) < 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")

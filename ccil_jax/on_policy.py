@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,8 +28,9 @@ REWARD, COST = 0, 1  # order along every axis of length 2: critics, signals, dir
 class Agent(NamedTuple):
     """What the runner knows of a learner: pure functions of one seed."""
 
-    init: Callable[[jax.Array], "AgentState"]
-    step: Callable[["AgentState"], tuple["AgentState", Metrics]]  # one iteration
+    init: Callable[[jax.Array], Any]
+    step: Callable[[Any], tuple[Any, Metrics]]  # state -> state, metrics: one iteration
+    bulk: frozenset[str] = frozenset()  # fields of the state that are too large for `guard` to check and hold back
 
 
 @struct.dataclass(kw_only=True)

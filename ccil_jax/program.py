@@ -1,19 +1,21 @@
-"""One compiled program over all seeds: `jit(vmap(scan(iteration)))`, spread over the local devices."""
+"""One compiled program over all seeds: `jit(vmap(loop(iteration)))`, spread over the local devices."""
 
 import dataclasses
-import math
 import os
 import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from ccil_jax import on_policy
+from ccil_jax import guard, on_policy
 from ccil_jax.config import Config
-from ccil_jax.on_policy import AgentState
+from ccil_jax.guard import GuardedState
+from ccil_jax.on_policy import Agent
 from ccil_jax.types import ExpertData, Metrics
 from envs.base import Environment
 
@@ -24,10 +26,11 @@ LONGEST_CHUNK = 10  # iterations between two looks from Python
 class Program:
     """The compiled functions of one configuration."""
 
-    init: Callable[[jax.Array], AgentState]  # keys [S] -> state
-    state: AgentState  # shapes, dtypes and shardings
-    chunk: Callable[[AgentState], tuple[AgentState, Metrics]]  # state (donated) -> state, metrics [S, chunk_length]
-    chunk_length: int
+    init: Callable[[jax.Array], GuardedState]  # keys [S] -> state
+    state: GuardedState  # shapes, dtypes and shardings
+    # state (donated), and how many iterations (default: chunk_length) -> state, metrics [S, that many]
+    chunk: Callable[..., tuple[GuardedState, Metrics]]
+    chunk_length: int  # the most
     compile_seconds: float
 
 
@@ -43,37 +46,52 @@ def seed_mesh(num_seeds: int) -> jax.sharding.Mesh:
     return jax.make_mesh((size,), ("seeds",), axis_types=(AxisType.Auto,), devices=devices[:size])
 
 
-def compile_program(
-    config: Config, env: Environment, expert: ExpertData | None, num_seeds: int, num_done: int = 0
-) -> Program:
-    """`jit(vmap(scan(iteration)))` over seeds, compiled once and spread over `seed_mesh`.
+def make_agent(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
+    """The agent of `config.method`, guarded against numbers that are not finite."""
+    return guard.protect(on_policy.make(config, env, expert), config.max_skipped_updates)
+
+
+def compile_program(config: Config, env: Environment, expert: ExpertData | None, num_seeds: int) -> Program:
+    """`jit(vmap(loop(iteration)))` over seeds, compiled once and spread over `seed_mesh`.
 
     Args:
         config: resolved.
         env: one environment, unbatched.
         expert: None for task rewards.
         num_seeds: S.
-        num_done: iterations behind a run that is continued: chunks lead from there to exactly `num_iterations`.
     """
-    common = math.gcd(config.num_iterations, num_done)
-    chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if common % n == 0)
+    chunk_length = min(LONGEST_CHUNK, config.num_iterations)
     mesh = seed_mesh(num_seeds)
 
-    def init(config: Config, expert: ExpertData | None, keys: jax.Array) -> AgentState:
-        return jax.vmap(on_policy.make(config, env, expert).init)(keys)
+    def init(config: Config, expert: ExpertData | None, keys: jax.Array) -> GuardedState:
+        return jax.vmap(make_agent(config, env, expert).init)(keys)
 
-    def chunk(config: Config, expert: ExpertData | None, state: AgentState) -> tuple[AgentState, Metrics]:
-        agent = on_policy.make(config, env, expert)
+    @jax.jit
+    def step(config: Config, expert: ExpertData | None, state: GuardedState) -> tuple[GuardedState, Metrics]:
+        return make_agent(config, env, expert).step(state)
 
-        def iterate(state: AgentState) -> tuple[AgentState, Metrics]:
-            return jax.lax.scan(lambda state, _: agent.step(state), state, None, length=chunk_length)
+    def chunk(
+        config: Config, expert: ExpertData | None, length: jax.Array, state: GuardedState
+    ) -> tuple[GuardedState, Metrics]:
+        def iterate(state: GuardedState) -> tuple[GuardedState, Metrics]:
+            # How many is decided at the call: the host looks about once a second, however long an iteration takes.
+            blank = jax.tree.map(
+                lambda row: jnp.zeros((chunk_length, *row.shape), row.dtype),
+                jax.eval_shape(step, config, expert, state)[1],
+            )
+
+            def turn(index: jax.Array, carry: tuple[GuardedState, Metrics]) -> tuple[GuardedState, Metrics]:
+                state, row = step(config, expert, carry[0])
+                return state, jax.tree.map(lambda rows, value: rows.at[index].set(value), carry[1], row)
+
+            return jax.lax.fori_loop(0, length, turn, (state, blank))
 
         return jax.vmap(iterate)(state)
 
-    def spread(function: Callable[..., Any]) -> Callable[..., Any]:
+    def spread(function: Callable[..., Any], *replicated: P) -> Callable[..., Any]:
         # Seeds never communicate, so each device runs its share of them as a program of its own.
         return jax.shard_map(
-            function, mesh=mesh, in_specs=(P(), P(), P("seeds")), out_specs=P("seeds"), check_vma=False
+            function, mesh=mesh, in_specs=(*replicated, P("seeds")), out_specs=P("seeds"), check_vma=False
         )
 
     start = time.perf_counter()
@@ -81,16 +99,24 @@ def compile_program(
     config, expert = jax.device_put((config, expert), replicated)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), num_seeds))
     shardings = (replicated, replicated, by_seed)
-    jitted_init = jax.jit(spread(init), in_shardings=shardings, out_shardings=by_seed)
+    jitted_init = jax.jit(spread(init, P(), P()), in_shardings=shardings, out_shardings=by_seed)
     compiled_init = jitted_init.lower(config, expert, keys).compile()
     state = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=by_seed),
         jax.eval_shape(init, config, expert, keys),
     )
-    compiled_chunk = jax.jit(spread(chunk), donate_argnums=2).lower(config, expert, state).compile()
+    jitted_chunk = jax.jit(spread(chunk, P(), P(), P()), donate_argnums=3)
+    length = jax.device_put(np.int32(chunk_length), replicated)
+    compiled_chunk = jitted_chunk.lower(config, expert, length, state).compile()
+
+    def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
+        wanted = jax.device_put(np.int32(length), replicated)
+        state, metrics = compiled_chunk(config, expert, wanted, state)
+        return state, metrics if length == chunk_length else {k: v[:, :length] for k, v in metrics.items()}
+
     return Program(
         init=lambda keys: compiled_init(config, expert, jax.device_put(keys, by_seed)),
-        chunk=lambda state: compiled_chunk(config, expert, state),
+        chunk=run,
         state=state,
         chunk_length=chunk_length,
         compile_seconds=time.perf_counter() - start,

@@ -10,17 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import on_policy
+from ccil_jax import guard, locking
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, validate
 from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.on_policy import AgentState
-from ccil_jax.program import compile_program
+from ccil_jax.digests import CheckpointError
+from ccil_jax.guard import GuardedState
+from ccil_jax.program import Program, compile_program, make_agent
 from ccil_jax.rollout import Actor
 from ccil_jax.types import ExpertData, Metrics
 from envs.base import Environment
 
-CHECKPOINT_SECONDS = 60.0  # at most this much work is lost, plus one chunk
+CHECKPOINT_SECONDS = 60.0  # about this much work is lost with a killed process
+SAVING_SHARE = 0.02  # of the time: large states are saved less often
+CHUNK_SECONDS = 1.0  # between two looks from Python, unless one iteration takes longer
 
 History = dict[str, np.ndarray]
 
@@ -34,6 +37,7 @@ class Progress:
     metrics: History  # the new rows, [chunk, num_seeds] each
     env_steps_per_second: float  # of this chunk, all seeds together
     compile_seconds: float
+    stopped: np.ndarray  # [num_seeds] bool: seeds given up, after too many iterations in a row that were not finite
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -42,10 +46,11 @@ class Result:
 
     config: Config  # as resolved: cost_limit is set
     metrics: History  # [iterations, num_seeds] each
-    state: AgentState  # [num_seeds]-leading
+    state: GuardedState  # [num_seeds]-leading
     env_steps: int  # per seed
     compile_seconds: float
     wall_seconds: float  # of this call, compilation included
+    stopped: np.ndarray  # [num_seeds] bool, as in `Progress`
 
     @property
     def agent(self) -> Actor:
@@ -103,7 +108,9 @@ def train(
     seed: int = 0,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
+    on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
     stop_after: int | None = None,
 ) -> Result:
     """Trains `config.method` with `num_seeds` seeds in one vmapped program.
@@ -115,52 +122,68 @@ def train(
         num_seeds: S.
         seed: of the S keys; the same seed and S give the same bits.
         checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
-        resume: continue from the newest checkpoint in `checkpoint_dir`.
+        resume: continue from the newest intact checkpoint in `checkpoint_dir`.
+        on_start: called once, before the first iteration, with the metrics of those that are done ({} if none is).
         on_progress: called after every chunk of iterations.
-        stop_after: stop once this many iterations are done (a multiple of the chunk), to be resumed later.
+        should_stop: asked after every chunk; once true, the state is saved and the result so far is returned.
+        stop_after: stop once this many iterations are done, to be resumed later.
 
     Raises:
-        ConfigError: options, environment and demonstrations do not fit together.
+        ConfigError: options, environment and demonstrations do not fit together; or the checkpoints are damaged, those
+            of another configuration, in use by another process, or cannot be written.
     """
     start = time.perf_counter()
     config = resolve(config, env, demonstrations)
     if num_seeds < 1:
         raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
-    keys = jax.random.split(jax.random.key(seed), num_seeds)
     last = min(stop_after or config.num_iterations, config.num_iterations)
 
     with contextlib.ExitStack() as stack:
-        checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
-        done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
-        program = compile_program(config, env, expert_data(demonstrations), num_seeds, num_done=done)
-        if checkpoints and done:
-            like = {"state": program.state, "history": checkpoints.structure(done)["history"]}
-            saved = checkpoints.restore(done, like)
-            state, history = saved["state"], saved["history"]
+        checkpoints = None
+        if checkpoint_dir:
+            stack.enter_context(locking.hold(checkpoint_dir / ".writer.lock"))
+            checkpoints = stack.enter_context(Checkpointer(checkpoint_dir, config))
+        found = checkpoints.latest_step() if checkpoints and resume else None
+        program = compile_program(config, env, expert_data(demonstrations), num_seeds)
+        if checkpoints and found:
+            done, (state, history) = found, _restore(checkpoints, found, program)
         else:
-            state, history = program.init(keys), {}
-        saved_at = time.perf_counter()
-        while done < last:
+            keys = jax.random.split(jax.random.key(seed), num_seeds)
+            done, state, history = 0, program.init(keys), {}
+        if on_start:
+            on_start(history)
+        stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
+        saved_at, saving, length = time.perf_counter(), 0.0, 1
+        while done < last and not stopped.all():
             chunk_start = time.perf_counter()
-            state, metrics = program.chunk(state)
+            length = min(length, last - done)
+            state, metrics = program.chunk(state, length)
             rows = _rows(metrics, done, config)
+            stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
             elapsed = time.perf_counter() - chunk_start
             history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
-            done += program.chunk_length
-            if checkpoints and (done >= last or time.perf_counter() - saved_at > CHECKPOINT_SECONDS):
+            done += length
+            stop = done >= last or bool(stopped.all()) or (should_stop is not None and should_stop())
+            due = time.perf_counter() - saved_at > max(CHECKPOINT_SECONDS, saving / SAVING_SHARE)
+            if checkpoints and (stop or due):
+                saving_start = time.perf_counter()
                 checkpoints.save(done, {"state": state, "history": history})
                 saved_at = time.perf_counter()
+                saving = saved_at - saving_start
             if on_progress:
-                rate = program.chunk_length * config.steps_per_iteration * num_seeds / elapsed
                 on_progress(
                     Progress(
                         iteration=done,
                         num_iterations=config.num_iterations,
                         metrics=rows,
-                        env_steps_per_second=rate,
+                        env_steps_per_second=length * config.steps_per_iteration * num_seeds / elapsed,
                         compile_seconds=program.compile_seconds,
+                        stopped=stopped,
                     )
                 )
+            if stop:
+                break
+            length = max(1, min(program.chunk_length, int(CHUNK_SECONDS * length / elapsed)))
     return Result(
         config=config,
         metrics=history,
@@ -168,14 +191,21 @@ def train(
         env_steps=done * config.steps_per_iteration,
         compile_seconds=program.compile_seconds,
         wall_seconds=time.perf_counter() - start,
+        stopped=stopped,
     )
+
+
+def _restore(checkpoints: Checkpointer, step: int, program: Program) -> tuple[GuardedState, History]:
+    like = {"state": program.state, "history": checkpoints.structure(step)["history"]}
+    saved = checkpoints.restore(step, like)
+    return saved["state"], saved["history"]
 
 
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
     """The policies of the newest checkpoint in `checkpoint_dir`. Demonstrations are not needed.
 
     Raises:
-        FileNotFoundError: there is no finished checkpoint.
+        CheckpointError: there is no intact checkpoint, or it is another configuration's.
     """
     config = config.replace(cost_limit=config.cost_limit or 0.0)
     steps = ExpertData(
@@ -185,18 +215,19 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
         held_out_action=jnp.zeros((1, env.action_dim)),
     )  # only their widths matter
 
-    def init(key: jax.Array) -> AgentState:
-        return jax.vmap(on_policy.make(config, env, steps).init)(jax.random.split(key, num_seeds))
+    def init(key: jax.Array) -> GuardedState:
+        return jax.vmap(make_agent(config, env, steps).init)(jax.random.split(key, num_seeds))
 
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     like = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device),
         jax.eval_shape(init, jax.random.key(0)),
     )
-    with Checkpointer(checkpoint_dir) as checkpoints:
+    # The limit as resolved is not known without the demonstrations.
+    with Checkpointer(checkpoint_dir, config, free=frozenset({"cost_limit"}), readonly=True) as checkpoints:
         step = checkpoints.latest_step()
         if step is None:
-            raise FileNotFoundError(f"{checkpoint_dir}: holds no finished checkpoint")
+            raise CheckpointError(f"{checkpoint_dir}: holds no finished checkpoint; train first, or continue the run")
         saved = checkpoints.restore(step, {"state": like, "history": checkpoints.structure(step)["history"]})
     return Loaded(config=config, agent=saved["state"].actor)
 

@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ccil_jax import locking
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
-from experiments import devices, run_folder, summary
+from experiments import devices, faults, run_folder, summary
+from experiments.interruption import Interruption
 from experiments.progress import Display
 
 if TYPE_CHECKING:
     from ccil_jax.evaluation import Evaluation
-    from ccil_jax.runner import Progress, Result
+    from ccil_jax.runner import History, Progress, Result
 
 _EVALUATION_SEED_OFFSET = 10_000_019  # keeps evaluation episodes apart from training with the same --seed
 
@@ -60,10 +62,24 @@ class Outcome:
     random: "Evaluation"  # [1, num_episodes]
     summary: dict[str, Any]
 
+    @property
+    def status(self) -> int:
+        """Exit status: 1 where a seed had to be given up."""
+        return int(self.result.stopped.any())
+
 
 def execute(plan: Plan) -> Outcome:
-    """Trains, evaluates, writes the whole run folder and prints the table."""
-    with Display(f"{plan.config.method} {plan.task}", plan.config.num_iterations, plan.cost_limit) as display:
+    """Trains, evaluates, writes the whole run folder and prints the table.
+
+    Raises:
+        LockedError: another process works in the run folder.
+        SystemExit: a signal ended the run; its state is saved.
+    """
+    with (
+        locking.hold(plan.folder / "checkpoints" / ".run.lock"),
+        Display(f"{plan.config.method} {plan.task}", plan.config.num_iterations, plan.cost_limit) as display,
+        Interruption() as interruption,
+    ):
         display.message(
             f"{plan.config.method} on {plan.task}: {plan.num_seeds} seed(s), {plan.config.env_steps:,} steps each, "
             f"into {plan.folder}; compiling ..."
@@ -76,7 +92,9 @@ def execute(plan: Plan) -> Outcome:
         earlier = [run_folder.read_run(plan.folder).facts["command"]] if plan.resume else []
         plan = dataclasses.replace(plan, command="\n".join([*earlier, plan.command]))
         run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
-        result, rate = _train(plan, env, display)
+        result, rate = _train(plan, env, display, interruption)
+        for seed in np.flatnonzero(result.stopped):
+            display.message(f"seed {seed} stopped: {faults.write(plan.folder, result, int(seed))}")
         display.message(f"evaluating {plan.eval_episodes} episodes per seed ...")
         from ccil_jax import evaluation
 
@@ -84,17 +102,21 @@ def execute(plan: Plan) -> Outcome:
             result.config, result.agent, env, num_episodes=plan.eval_episodes, seed=plan.evaluation_seed
         )
         random = evaluation.random_policy(env, num_episodes=plan.eval_episodes, seed=plan.evaluation_seed)
-    content = _finish(plan, result, rate, evaluated, random)
+        content = _finish(plan, result, rate, evaluated, random)
     return Outcome(plan=plan, result=result, env=env, evaluation=evaluated, random=random, summary=content)
 
 
-def _train(plan: Plan, env: Any, display: Display) -> tuple["Result", float | None]:
+def _train(plan: Plan, env: Any, display: Display, interruption: Interruption) -> tuple["Result", float | None]:
     """The result, and environment steps per second of all seeds, compilation aside (None if nothing was left to do)."""
     from ccil_jax import runner
 
     steps = seconds = 0.0
 
     with run_folder.MetricsWriter(plan.folder) as writer:
+
+        def on_start(history: "History") -> None:
+            writer.begin(history)
+            interruption.defer()
 
         def on_progress(progress: "Progress") -> None:
             nonlocal steps, seconds
@@ -112,8 +134,14 @@ def _train(plan: Plan, env: Any, display: Display) -> tuple["Result", float | No
             seed=plan.seed,
             checkpoint_dir=plan.folder.resolve() / "checkpoints",  # orbax fails in the background on a relative path
             resume=plan.resume,
+            on_start=on_start,
             on_progress=on_progress,
+            should_stop=interruption.requested,
         )
+    done = result.env_steps // plan.config.steps_per_iteration
+    interruption.settle(
+        f"stopped and saved after iteration {done} of {plan.config.num_iterations}; continue with --resume"
+    )
     return result, steps / seconds if seconds else None
 
 

@@ -24,6 +24,8 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOU
 ORDER = (
     "npz",
     "config",
+    "locking",
+    "versions",
     "types",
     "distributions",
     "networks",
@@ -39,8 +41,10 @@ ORDER = (
     "methods",
     "policy_step",
     "on_policy",
+    "guard",
     "program",
     "evaluation",
+    "digests",
     "checkpointing",
     "runner",
 )
