@@ -1,5 +1,13 @@
-"""Whole-state checkpoints: the only module that knows orbax."""
+"""Whole-state checkpoints that can be believed: the only module that knows orbax.
 
+Orbax commits a step by renaming a folder, so that a killed process leaves none half-written. What it does not notice
+(flipped bits, other dtypes, a second writer, a disk that fills up behind its back) is what the manifests are for.
+"""
+
+import errno
+import logging
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -7,24 +15,44 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from ccil_jax.config import ConfigError
+from ccil_jax import digests
+from ccil_jax.config import Config
+from ccil_jax.digests import CheckpointError, DamageError
 from ccil_jax.types import PyTree
 
 KEPT = 2  # newest checkpoints that stay on disk
+_FREE = frozenset({"env_steps"})  # a finished run may be continued for longer
+_OVERHEAD = 2**20  # bytes of orbax's own files, at most
+_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-
-class CheckpointError(ConfigError):
-    """A checkpoint that does not fit. The message names it and the likely reason."""
+_log = logging.getLogger(__name__)  # warnings go to stderr unless the program says otherwise
 
 
 class Checkpointer:
-    """Saves and restores one pytree per step under `directory`. Close it, or use it as a context manager."""
+    """Saves and restores one pytree per step under `directory`. Close it, or use it as a context manager.
 
-    def __init__(self, directory: Path) -> None:
-        # Orbax fails in the background on a relative path.
-        options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, create=True)
+    Args:
+        directory: made if need be. One writer at a time: hold its lock (`ccil_jax.locking`).
+        config: of the run; a step that was written under another is refused.
+        free: further fields in which the configurations may differ.
+        readonly: never touches what is there, so that a run can be read while it is written.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        config: Config | None = None,
+        *,
+        free: frozenset[str] = frozenset(),
+        readonly: bool = False,
+    ) -> None:
+        self._directory = directory.resolve()  # orbax fails in the background on a relative path
+        self._config, self._free, self._readonly = config, free | _FREE, readonly
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=None if readonly else KEPT, create=not readonly, read_only=readonly
+        )
         handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
-        self._manager = ocp.CheckpointManager(directory.resolve(), options=options, item_handlers=handler)
+        self._manager = ocp.CheckpointManager(self._directory, options=options, item_handlers=handler)
 
     def __enter__(self) -> "Checkpointer":
         return self
@@ -33,12 +61,71 @@ class Checkpointer:
         self.close()
 
     def latest_step(self) -> int | None:
-        """The newest finished step, or None."""
-        return self._manager.latest_step()
+        """The newest step that is finished and intact, or None if none was ever finished.
+
+        What is newer is set aside with a warning that names it.
+
+        Raises:
+            CheckpointError: steps were finished, and every one of them is damaged.
+        """
+        damaged: DamageError | None = None
+        passed = []
+        good = None
+        for step in sorted(self._manager.all_steps(), reverse=True):
+            folder = self._directory / str(step)
+            try:
+                digests.read(folder)
+            except DamageError as error:
+                passed.append((folder, error))
+                damaged = error if (folder / digests.NAME).exists() else damaged
+                continue
+            good = step
+            break
+        if good is None and len(passed) > 1:  # a kill leaves one unfinished step, no more
+            damaged = damaged or passed[0][1]
+        if good is None and damaged is not None:
+            raise CheckpointError(f"{damaged}; no other is intact: restore it from a copy, or begin a new run")
+        for folder, error in passed:
+            remedy = "starting over" if good is None else f"going on from step {good}"
+            _log.warning("warning: %s; %s", error, remedy)
+            self._set_aside(folder)
+        return good
+
+    def _set_aside(self, folder: Path) -> None:
+        if self._readonly:
+            return
+        target = folder.with_name(f"{folder.name}.damaged")
+        shutil.rmtree(target, ignore_errors=True)
+        folder.rename(target)
+        self._manager.reload()
 
     def save(self, step: int, state: PyTree) -> None:
-        """Starts saving; returns once the arrays are copied, so that the caller may donate them."""
-        self._manager.save(step, args=ocp.args.StandardSave(state))
+        """Saves, and proves that it is on disk. Raises `CheckpointError` where the disk is full or fails."""
+        leaves = [jax.random.key_data(x) if _is_key(x) else x for x in jax.tree.leaves(state)]
+        needed = sum(leaf.nbytes for leaf in leaves) + _OVERHEAD
+        free = shutil.disk_usage(self._directory).free
+        folder = self._directory / str(step)
+        if free < needed:
+            raise CheckpointError(self._no_space(folder, needed, free))
+        try:
+            self._manager.save(step, args=ocp.args.StandardSave(state))
+            # Waiting costs little and tells of a failure now, not one save later.
+            self._manager.wait_until_finished()
+            digests.write(folder, state, self._config)
+        except (OSError, ValueError, RuntimeError) as error:  # TensorStore reports the system's errors as ValueError
+            if _is_disk_error(error):
+                free = shutil.disk_usage(self._directory).free
+                raise CheckpointError(self._no_space(folder, needed, free)) from error
+            raise CheckpointError(
+                f"{folder}: cannot be written ({_first_line(error)}); see to the disk and resume"
+            ) from error
+
+    def _no_space(self, folder: Path, needed: int, free: int) -> str:
+        kept = ", ".join(str(step) for step in self._manager.all_steps() if step != int(folder.name)) or "none"
+        return (
+            f"{folder}: no space left on the disk; the checkpoint needs up to {needed:,} bytes, {free:,} are free; "
+            f"make space and continue with --resume (steps kept: {kept})"
+        )
 
     def restore(self, step: int, like: PyTree) -> PyTree:
         """The state saved at `step`; `like` gives structure, shapes, dtypes and shardings.
@@ -46,13 +133,16 @@ class Checkpointer:
         Raises:
             CheckpointError: what was saved is something else, or damaged.
         """
+        folder = self._directory / str(step)
+        manifest = digests.read(folder)
+        digests.check_config(folder, manifest, self._config, self._free)
+        digests.check_arrays(folder, manifest, jax.tree.map(_shape, like))
         try:
-            return self._manager.restore(step, args=ocp.args.StandardRestore(like))
-        except (ValueError, KeyError, TypeError) as error:
-            raise CheckpointError(
-                f"{self._manager.directory}/{step}: cannot be restored; it was damaged, or written under another "
-                f"configuration or version of ccil_jax ({str(error).splitlines()[0]})"
-            ) from error
+            state = self._manager.restore(step, args=ocp.args.StandardRestore(like))
+        except (ValueError, KeyError, TypeError, OSError) as error:
+            raise CheckpointError(f"{folder}: cannot be restored ({_first_line(error)})") from error
+        digests.check_arrays(folder, manifest, state)
+        return state
 
     def structure(self, step: int) -> PyTree:
         """What was saved at `step`, as empty NumPy arrays of its shapes and dtypes."""
@@ -60,6 +150,23 @@ class Checkpointer:
         return jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
 
     def close(self) -> None:
-        """Waits for saves in flight."""
-        self._manager.wait_until_finished()
+        """Frees the manager's threads. No save is in flight."""
         self._manager.close()
+
+
+def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+
+
+def _is_key(leaf: Any) -> bool:
+    return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def _is_disk_error(error: BaseException) -> bool:
+    if isinstance(error, OSError) and error.errno in _DISK:
+        return True
+    return any(os.strerror(number) in str(error) or errno.errorcode[number] in str(error) for number in _DISK)
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

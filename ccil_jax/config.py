@@ -99,6 +99,9 @@ class Config:
     value_loss: str = _static(
         "value", "second term of iq_learn's loss: V - y over expert and learner, or v0, (1 - gamma) V at first states"
     )
+    max_skipped_updates: int = _static(
+        10, "a seed stops after so many iterations in a row that were not finite; each is taken back"
+    )
 
     gamma: float = _traced(0.995, "discount of reward and cost (Table 1)")
     gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation, of the reward (Table 1)")
@@ -254,6 +257,7 @@ def validate(config: Config) -> None:
         "bc_epochs",
         "replay_size",
         "updates_per_step",
+        "max_skipped_updates",
     ):
         if getattr(config, name) < 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")

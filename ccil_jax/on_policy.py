@@ -30,6 +30,7 @@ class Agent(NamedTuple):
 
     init: Callable[[jax.Array], Any]  # key -> state
     step: Callable[[Any], tuple[Any, Metrics]]  # one iteration
+    bulk: frozenset[str] = frozenset()  # fields of the state that are too large for `guard` to check and hold back
 
 
 @struct.dataclass(kw_only=True)

@@ -1,10 +1,9 @@
-"""One compiled program over all runs: `jit(vmap(scan(iteration)))`, spread over the local devices.
+"""One compiled program over all runs: `jit(vmap(loop(iteration)))`, spread over the local devices.
 
 A run is a seed with its traced hyperparameters.
 """
 
 import dataclasses
-import math
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -12,12 +11,16 @@ from types import MappingProxyType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from ccil_jax import agents
+from ccil_jax import agents, guard
 from ccil_jax.config import Config
-from ccil_jax.types import ExpertData, Metrics, PyTree
+from ccil_jax.guard import GuardedState
+from ccil_jax.on_policy import Agent
+from ccil_jax.types import ExpertData, Metrics
 from envs.base import Environment
 
 LONGEST_CHUNK = 10  # iterations between two looks from Python
@@ -29,10 +32,11 @@ NONE_VARIED: Varied = MappingProxyType({})
 class Program:
     """The compiled functions of R runs that share their static hyperparameters."""
 
-    init: Callable[[jax.Array], PyTree]  # keys [R] -> state
-    state: PyTree  # shapes, dtypes and shardings
-    chunk: Callable[[PyTree], tuple[PyTree, Metrics]]  # state (donated) -> state, metrics [R, chunk_length]
-    chunk_length: int
+    init: Callable[[jax.Array], GuardedState]  # keys [R] -> state
+    state: GuardedState  # shapes, dtypes and shardings
+    # state (donated), and how many iterations (default: chunk_length) -> state, metrics [R, that many]
+    chunk: Callable[..., tuple[GuardedState, Metrics]]
+    chunk_length: int  # the most
     compile_seconds: float
     text: Callable[[], str]  # of `chunk`, as XLA has compiled it
 
@@ -56,49 +60,67 @@ def over_runs(function: Callable[..., Any], one_by_one: bool) -> Callable[..., A
     return jax.vmap(function)
 
 
+def make_agent(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
+    """The agent of `config.method`, guarded against numbers that are not finite."""
+    return guard.protect(agents.make(config, env, expert), config.max_skipped_updates)
+
+
 def compile_program(
     config: Config,
     env: Environment,
     expert: ExpertData | None,
     num_runs: int,
-    num_done: int = 0,
     varied: Varied = NONE_VARIED,
     one_by_one: bool = False,
 ) -> Program:
-    """`jit(vmap(scan(iteration)))` over runs, compiled once and spread over `run_mesh`.
+    """`jit(vmap(loop(iteration)))` over runs, compiled once and spread over `run_mesh`.
 
     Args:
         config: resolved.
         env: one environment, unbatched.
         expert: None for task rewards.
         num_runs: R.
-        num_done: iterations behind a run that is continued: chunks lead from there to exactly `num_iterations`.
         varied: values [R] of the traced fields of `config` that are not the same in all runs, by name.
         one_by_one: a device takes its runs in turn instead of side by side. Batched products are rounded otherwise
             than single ones, so only then are the bits of a run the same however many share its device. XLA treats a
             program for a single device differently, though: this holds among meshes of two devices or more.
     """
-    common = math.gcd(config.num_iterations, num_done)
-    chunk_length = max(n for n in range(1, LONGEST_CHUNK + 1) if common % n == 0)
+    chunk_length = min(LONGEST_CHUNK, config.num_iterations)
     mesh = run_mesh(num_runs)
 
-    def init(config: Config, expert: ExpertData | None, varied: Varied, keys: jax.Array) -> PyTree:
-        def init_run(values: Varied, key: jax.Array) -> PyTree:
-            return agents.make(config.replace(**values), env, expert).init(key)
+    def init(config: Config, expert: ExpertData | None, varied: Varied, keys: jax.Array) -> GuardedState:
+        def init_run(values: Varied, key: jax.Array) -> GuardedState:
+            return make_agent(config.replace(**values), env, expert).init(key)
 
         return over_runs(init_run, one_by_one)(varied, keys)
 
-    def chunk(config: Config, expert: ExpertData | None, varied: Varied, state: PyTree) -> tuple[PyTree, Metrics]:
-        def iterate(values: Varied, state: PyTree) -> tuple[PyTree, Metrics]:
-            agent = agents.make(config.replace(**values), env, expert)
-            return jax.lax.scan(lambda state, _: agent.step(state), state, None, length=chunk_length)
+    @jax.jit
+    def step(config: Config, expert: ExpertData | None, state: GuardedState) -> tuple[GuardedState, Metrics]:
+        return make_agent(config, env, expert).step(state)
+
+    def chunk(
+        config: Config, expert: ExpertData | None, length: jax.Array, varied: Varied, state: GuardedState
+    ) -> tuple[GuardedState, Metrics]:
+        def iterate(values: Varied, state: GuardedState) -> tuple[GuardedState, Metrics]:
+            own = config.replace(**values)
+            # How many is decided at the call: the host looks about once a second, however long an iteration takes.
+            blank = jax.tree.map(
+                lambda row: jnp.zeros((chunk_length, *row.shape), row.dtype),
+                jax.eval_shape(step, own, expert, state)[1],
+            )
+
+            def turn(index: jax.Array, carry: tuple[GuardedState, Metrics]) -> tuple[GuardedState, Metrics]:
+                state, row = step(own, expert, carry[0])
+                return state, jax.tree.map(lambda rows, value: rows.at[index].set(value), carry[1], row)
+
+            return jax.lax.fori_loop(0, length, turn, (state, blank))
 
         return over_runs(iterate, one_by_one)(varied, state)
 
-    def spread(function: Callable[..., Any]) -> Callable[..., Any]:
+    def spread(function: Callable[..., Any], *replicated: P) -> Callable[..., Any]:
         # Runs never communicate, so each device carries out its share of them as a program of its own.
         return jax.shard_map(
-            function, mesh=mesh, in_specs=(P(), P(), P("runs"), P("runs")), out_specs=P("runs"), check_vma=False
+            function, mesh=mesh, in_specs=(*replicated, P("runs"), P("runs")), out_specs=P("runs"), check_vma=False
         )
 
     start = time.perf_counter()
@@ -107,16 +129,24 @@ def compile_program(
     by_name = jax.device_put(dict(varied), by_run)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), num_runs))
     shardings = (replicated, replicated, by_run, by_run)
-    jitted_init = jax.jit(spread(init), in_shardings=shardings, out_shardings=by_run)
+    jitted_init = jax.jit(spread(init, P(), P()), in_shardings=shardings, out_shardings=by_run)
     compiled_init = jitted_init.lower(config, expert, by_name, keys).compile()
     state = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=by_run),
         jax.eval_shape(init, config, expert, by_name, keys),
     )
-    compiled_chunk = jax.jit(spread(chunk), donate_argnums=3).lower(config, expert, by_name, state).compile()
+    jitted_chunk = jax.jit(spread(chunk, P(), P(), P()), donate_argnums=4)
+    length = jax.device_put(np.int32(chunk_length), replicated)
+    compiled_chunk = jitted_chunk.lower(config, expert, length, by_name, state).compile()
+
+    def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
+        wanted = jax.device_put(np.int32(length), replicated)
+        state, metrics = compiled_chunk(config, expert, wanted, by_name, state)
+        return state, metrics if length == chunk_length else {k: v[:, :length] for k, v in metrics.items()}
+
     return Program(
         init=lambda keys: compiled_init(config, expert, by_name, jax.device_put(keys, by_run)),
-        chunk=lambda state: compiled_chunk(config, expert, by_name, state),
+        chunk=run,
         state=state,
         chunk_length=chunk_length,
         compile_seconds=time.perf_counter() - start,

@@ -10,16 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import agents, iq_learn
+from ccil_jax import guard, iq_learn, locking
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, field_names, validate
 from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.program import compile_program
+from ccil_jax.digests import CheckpointError
+from ccil_jax.guard import GuardedState
+from ccil_jax.program import Program, compile_program, make_agent
 from ccil_jax.rollout import Actor
-from ccil_jax.types import ExpertData, ExpertTransitions, Metrics, PyTree
+from ccil_jax.types import ExpertData, ExpertTransitions, Metrics
 from envs.base import Environment
 
-CHECKPOINT_SECONDS = 60.0  # at most this much work is lost, plus one chunk
+CHECKPOINT_SECONDS = 60.0  # about this much work is lost with a killed process
+SAVING_SHARE = 0.02  # of the time: large states are saved less often
+CHUNK_SECONDS = 1.0  # between two looks from Python, unless one iteration takes longer
 
 History = dict[str, np.ndarray]
 
@@ -33,6 +37,7 @@ class Progress:
     metrics: History  # the new rows, [chunk, num_runs] each
     env_steps_per_second: float  # of this chunk, all runs together
     compile_seconds: float
+    stopped: np.ndarray  # [num_seeds] bool: seeds given up, after too many iterations in a row that were not finite
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,10 +46,11 @@ class Result:
 
     config: Config  # as resolved: cost_limit is set
     metrics: History  # [iterations, num_seeds] each
-    state: PyTree  # [num_seeds]-leading
+    state: GuardedState  # [num_seeds]-leading
     env_steps: int  # per seed
     compile_seconds: float
     wall_seconds: float  # of this call, compilation included
+    stopped: np.ndarray  # [num_seeds] bool, as in `Progress`
 
     @property
     def agent(self) -> Actor:
@@ -127,7 +133,9 @@ def train(
     one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
+    on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
     stop_after: int | None = None,
 ) -> Result:
     """Trains `config.method` with `num_seeds` seeds in one vmapped program.
@@ -141,12 +149,15 @@ def train(
         one_by_one: each device takes its seeds in turn, which is slower. Then a seed's bits do not depend on how many
             seeds there are, nor on the number of devices, as long as there are two or more.
         checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
-        resume: continue from the newest checkpoint in `checkpoint_dir`.
+        resume: continue from the newest intact checkpoint in `checkpoint_dir`.
+        on_start: called once, before the first iteration, with the metrics of those that are done ({} if none is).
         on_progress: called after every chunk of iterations.
-        stop_after: stop once this many iterations are done (a multiple of the chunk), to be resumed later.
+        should_stop: asked after every chunk; once true, the state is saved and the result so far is returned.
+        stop_after: stop once this many iterations are done, to be resumed later.
 
     Raises:
-        ConfigError: options, environment and demonstrations do not fit together.
+        ConfigError: options, environment and demonstrations do not fit together; or the checkpoints are damaged, those
+            of another configuration, in use by another process, or cannot be written.
     """
     return train_runs(
         [config],
@@ -157,7 +168,9 @@ def train(
         one_by_one=one_by_one,
         checkpoint_dir=checkpoint_dir,
         resume=resume,
+        on_start=on_start,
         on_progress=on_progress,
+        should_stop=should_stop,
         stop_after=stop_after,
     )[0]
 
@@ -172,7 +185,9 @@ def train_runs(
     one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
+    on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
     stop_after: int | None = None,
 ) -> list[Result]:
     """Trains several configurations that differ in traced fields alone, each with the same seeds, in one program.
@@ -189,43 +204,56 @@ def train_runs(
     configs = [resolve(config, env, demonstrations) for config in configs]
     config, varied = join(configs, num_seeds)
     num_runs = len(configs) * num_seeds
-    keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
     last = min(stop_after or config.num_iterations, config.num_iterations)
 
     with contextlib.ExitStack() as stack:
-        checkpoints = stack.enter_context(Checkpointer(checkpoint_dir)) if checkpoint_dir else None
-        done = (checkpoints.latest_step() or 0) if checkpoints and resume else 0
+        checkpoints = None
+        if checkpoint_dir:
+            stack.enter_context(locking.hold(checkpoint_dir / ".writer.lock"))
+            checkpoints = stack.enter_context(Checkpointer(checkpoint_dir, config))
+        found = checkpoints.latest_step() if checkpoints and resume else None
         program = compile_program(
-            config, env, expert_data(demonstrations), num_runs, num_done=done, varied=varied, one_by_one=one_by_one
+            config, env, expert_data(demonstrations), num_runs, varied=varied, one_by_one=one_by_one
         )
-        if checkpoints and done:
-            like = {"state": program.state, "history": checkpoints.structure(done)["history"]}
-            saved = checkpoints.restore(done, like)
-            state, history = saved["state"], saved["history"]
+        if checkpoints and found:
+            done, (state, history) = found, _restore(checkpoints, found, program)
         else:
-            state, history = program.init(keys), {}
-        saved_at = time.perf_counter()
-        while done < last:
+            keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
+            done, state, history = 0, program.init(keys), {}
+        if on_start:
+            on_start(history)
+        stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
+        saved_at, saving, length = time.perf_counter(), 0.0, 1
+        while done < last and not stopped.all():
             chunk_start = time.perf_counter()
-            state, metrics = program.chunk(state)
+            length = min(length, last - done)
+            state, metrics = program.chunk(state, length)
             rows = _rows(metrics, done, config)
+            stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
             elapsed = time.perf_counter() - chunk_start
             history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
-            done += program.chunk_length
-            if checkpoints and (done >= last or time.perf_counter() - saved_at > CHECKPOINT_SECONDS):
+            done += length
+            stop = done >= last or bool(stopped.all()) or (should_stop is not None and should_stop())
+            due = time.perf_counter() - saved_at > max(CHECKPOINT_SECONDS, saving / SAVING_SHARE)
+            if checkpoints and (stop or due):
+                saving_start = time.perf_counter()
                 checkpoints.save(done, {"state": state, "history": history})
                 saved_at = time.perf_counter()
+                saving = saved_at - saving_start
             if on_progress:
-                rate = program.chunk_length * config.steps_per_iteration * num_runs / elapsed
                 on_progress(
                     Progress(
                         iteration=done,
                         num_iterations=config.num_iterations,
                         metrics=rows,
-                        env_steps_per_second=rate,
+                        env_steps_per_second=length * config.steps_per_iteration * num_runs / elapsed,
                         compile_seconds=program.compile_seconds,
+                        stopped=stopped,
                     )
                 )
+            if stop:
+                break
+            length = max(1, min(program.chunk_length, int(CHUNK_SECONDS * length / elapsed)))
     return [
         Result(
             config=config,
@@ -234,6 +262,7 @@ def train_runs(
             env_steps=done * config.steps_per_iteration,
             compile_seconds=program.compile_seconds,
             wall_seconds=time.perf_counter() - start,
+            stopped=stopped[own],
         )
         for config, own in zip(configs, columns(len(configs), num_seeds), strict=True)
     ]
@@ -265,15 +294,21 @@ def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, j
 
 def save(result: Result, directory: Path) -> None:
     """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs."""
-    with Checkpointer(directory) as checkpoints:
+    with Checkpointer(directory, result.config) as checkpoints:
         checkpoints.save(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
+
+
+def _restore(checkpoints: Checkpointer, step: int, program: Program) -> tuple[GuardedState, History]:
+    like = {"state": program.state, "history": checkpoints.structure(step)["history"]}
+    saved = checkpoints.restore(step, like)
+    return saved["state"], saved["history"]
 
 
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
     """The policies of the newest checkpoint in `checkpoint_dir`. Demonstrations are not needed.
 
     Raises:
-        FileNotFoundError: there is no finished checkpoint.
+        CheckpointError: there is no intact checkpoint, or it is another configuration's.
     """
     config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
     obs, action = jnp.zeros((1, env.obs_dim)), jnp.zeros((1, env.action_dim))
@@ -282,18 +317,21 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
         obs=obs, action=action, held_out_obs=obs, held_out_action=action, transitions=transitions
     )
 
-    def init(key: jax.Array) -> PyTree:
-        return jax.vmap(agents.make(config, env, steps).init)(jax.random.split(key, num_seeds))
+    def init(key: jax.Array) -> GuardedState:
+        return jax.vmap(make_agent(config, env, steps).init)(jax.random.split(key, num_seeds))
 
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     like = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device),
         jax.eval_shape(init, jax.random.key(0)),
     )
-    with Checkpointer(checkpoint_dir) as checkpoints:
+    # The limit as resolved is not known without the demonstrations; the temperature does not matter for acting.
+    with Checkpointer(
+        checkpoint_dir, config, free=frozenset({"cost_limit", "temperature"}), readonly=True
+    ) as checkpoints:
         step = checkpoints.latest_step()
         if step is None:
-            raise FileNotFoundError(f"{checkpoint_dir}: holds no finished checkpoint")
+            raise CheckpointError(f"{checkpoint_dir}: holds no finished checkpoint; train first, or continue the run")
         saved = checkpoints.restore(step, {"state": like, "history": checkpoints.structure(step)["history"]})
     return Loaded(config=config, agent=saved["state"].actor)
 

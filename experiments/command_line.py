@@ -6,6 +6,7 @@ Nothing here imports JAX, so help and wrong input are answered at once.
 import argparse
 import datetime
 import difflib
+import errno
 import os
 import sys
 import tempfile
@@ -66,6 +67,11 @@ def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None]
         return run(arguments) or 0
     except (UsageError, ConfigError, DemonstrationsError) as error:
         parser.error(str(error))
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        parser.error(f"{where}{error.strerror}; make space and continue with --resume")
 
 
 def command() -> str:
@@ -119,7 +125,8 @@ def check_output_folder(
     """
     try:
         holds_run = (folder / record).is_file()
-        occupied = folder.is_dir() and any(folder.iterdir())
+        # A process that was killed before it began leaves locks and temporary files, whose names begin with a dot.
+        occupied = folder.is_dir() and any(path for path in folder.rglob("*") if not _is_left_over(path))
     except OSError as error:
         raise UsageError(f"{option} {folder}: cannot be read ({error.strerror}); choose another folder") from None
     if resume and not holds_run:
@@ -129,6 +136,10 @@ def check_output_folder(
     if occupied and not resume:
         raise UsageError(f"{option} {folder}: not empty; choose a new folder")
     check_writable(folder, option)
+
+
+def _is_left_over(path: Path) -> bool:
+    return path.name.startswith(".") or (path.name == "checkpoints" and path.is_dir())
 
 
 def check_writable(folder: Path, option: str) -> None:

@@ -3,20 +3,19 @@
 import csv
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
 import math
 import os
-import platform
 import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TextIO
 
 import numpy as np
 
 from ccil_jax.config import Config
+from ccil_jax.versions import versions
 from experiments.command_line import UsageError
 
 METRICS = (  # order of the columns; a method leaves out those that it lacks
@@ -46,12 +45,12 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "recovered_reward_learner",
     "loss",
     "held_out_loss",
+    "skipped_updates",
 )
 _FACTS = frozenset(
     {"task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations"}
     | {"expert_return", "expert_cost", "expert_length"}
 )
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -98,7 +97,11 @@ class Run:
 def read_run(folder: Path) -> Run:
     """Reads config.json. Raises `UsageError` if it is missing, damaged or of another version."""
     path = folder / "config.json"
-    facts = read_json(path)
+    return parse_run(path, read_json(path))
+
+
+def parse_run(path: Path, facts: dict[str, Any]) -> Run:
+    """What the content of a config.json says; `path` is where it came from. Raises `UsageError`."""
     fields = facts.pop("config", None)
     names = {f.name for f in dataclasses.fields(Config)}
     if not isinstance(fields, dict) or not _FACTS.issubset(facts):
@@ -106,18 +109,7 @@ def read_run(folder: Path) -> Run:
     if unknown := sorted(set(fields) - names):
         raise UsageError(f"{path}: field '{unknown[0]}' is not known to this version; use the version that wrote it")
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-    return Run(folder, Config(**values), facts)
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
-    found = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found
+    return Run(path.parent, Config(**values), facts)
 
 
 def git_commit() -> str | None:
@@ -165,45 +157,46 @@ def read_metrics(folder: Path) -> dict[str, np.ndarray]:
 
 
 class MetricsWriter:
-    """Appends to metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager."""
+    """Writes metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager.
+
+    `begin` first: the file then holds exactly the iterations that the run goes on from, whatever a killed process left.
+    """
 
     def __init__(self, folder: Path) -> None:
         from tensorboardX import SummaryWriter  # here: it imports protobuf, which no argument error should wait for
 
         self.path = folder / "metrics.csv"
         self._events: Any = SummaryWriter(logdir=str(folder))
-        self._names: list[str] | None = None
+        self._names: list[str] = []
+
+    def begin(self, history: Mapping[str, np.ndarray]) -> None:
+        """Replaces the file by the rows `[iterations, num_seeds]` of a checkpoint; none for a new run."""
+        temporary = self.path.with_name(".metrics.csv.tmp")
+        with temporary.open("w", newline="", encoding="utf-8") as file:
+            if history:
+                self._append(file, history, first=0)
+        temporary.replace(self.path)
 
     def write(self, iteration: int, metrics: Mapping[str, np.ndarray]) -> None:
         """Adds rows `[chunk, num_seeds]`; `iteration` is the number of iterations finished with the chunk's last."""
-        chunk, num_seeds = metrics["env_steps"].shape
-        if self._names is None:
-            self._begin(iteration - chunk, metrics)
-        rows = np.stack([np.asarray(metrics[name], np.float64) for name in self._names or ()], axis=-1)
         with self.path.open("a", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            for i in range(chunk):
-                number = iteration - chunk + i + 1
-                writer.writerows([number, s, *(f"{x:.9g}" for x in rows[i, s])] for s in range(num_seeds))
-                self._write_events(rows[i])
+            rows = self._append(file, metrics, first=iteration - len(metrics["env_steps"]))
+        for row in rows:
+            self._write_events(row)
 
-    def _begin(self, first: int, metrics: Mapping[str, np.ndarray]) -> None:
-        """Starts the file, or cuts off the rows after iteration `first`, which a resumed run does again."""
-        known = [name for name in METRICS if name in metrics]
-        self._names = known + sorted(set(metrics) - set(known))
-        header = ",".join(["iteration", "seed", *self._names])
-        kept = [header]
-        if first > 0 and self.path.is_file():
-            lines = self.path.read_text(encoding="utf-8").splitlines()
-            if lines[:1] != [header]:
-                raise UsageError(f"{self.path}: columns differ from this version's; resume with the version that began")
-            kept += [line for line in lines[1:] if int(line.split(",", 1)[0]) <= first]
-        temporary = self.path.with_name(".metrics.csv.tmp")
-        temporary.write_text("\n".join(kept) + "\n", encoding="utf-8")
-        temporary.replace(self.path)
+    def _append(self, file: TextIO, metrics: Mapping[str, np.ndarray], first: int) -> np.ndarray:
+        writer = csv.writer(file, lineterminator="\n")
+        if not self._names:
+            known = [name for name in METRICS if name in metrics]
+            self._names = known + sorted(set(metrics) - set(known))
+            writer.writerow(["iteration", "seed", *self._names])
+        rows = np.stack([np.asarray(metrics[name], np.float64) for name in self._names], axis=-1)
+        for number, row in enumerate(rows, first + 1):
+            writer.writerows([number, s, *(_text(x) for x in values)] for s, values in enumerate(row))
+        return rows
 
     def _write_events(self, row: np.ndarray) -> None:
-        names = self._names or []
+        names = self._names
         steps = int(row[0, names.index("env_steps")])
         for i, name in enumerate(names):
             if name != "env_steps":
@@ -218,3 +211,8 @@ class MetricsWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._events.close()
+
+
+def _text(value: float) -> str:
+    """Nine digits tell float32 numbers apart; counters are written in full."""
+    return str(int(value)) if value.is_integer() and abs(value) < 2**53 else f"{value:.9g}"

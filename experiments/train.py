@@ -110,9 +110,9 @@ def _shipped(task: str) -> Path:
     return path
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Checks everything, then trains."""
-    execute(make_plan(arguments))
+def run(arguments: argparse.Namespace) -> int:
+    """Checks everything, then trains; status 1 where a seed had to be given up."""
+    return execute(make_plan(arguments)).status
 
 
 def main(argv: Sequence[str] | None = None) -> int:

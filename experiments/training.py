@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ccil_jax import locking
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
-from experiments import devices, run_folder, summary
+from experiments import devices, faults, run_folder, summary
+from experiments.interruption import Interruption
 from experiments.progress import Display
 
 if TYPE_CHECKING:
     from ccil_jax.evaluation import Evaluation
-    from ccil_jax.runner import Progress, Result
+    from ccil_jax.runner import History, Progress, Result
 
 _EVALUATION_SEED_OFFSET = 10_000_019  # keeps evaluation episodes apart from training with the same --seed
 
@@ -63,9 +65,14 @@ class Outcome:
     random: "Evaluation"  # [1, num_episodes]
     summary: dict[str, Any]
 
+    @property
+    def status(self) -> int:
+        """Exit status: 1 where a seed had to be given up."""
+        return int(self.result.stopped.any())
+
 
 def execute(plan: Plan) -> Outcome:
-    """Trains, evaluates, writes the whole run folder and prints the table."""
+    """Trains, evaluates, writes the whole run folder and prints the table. Raises as `execute_together` does."""
     return execute_together([plan], plan.folder / "checkpoints")[0]
 
 
@@ -73,10 +80,19 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
     """Carries out plans that differ in traced hyperparameters and folders alone as one program.
 
     `checkpoint_dir` holds the checkpoints of all their runs together; in the end each folder has those of its own.
+
+    Raises:
+        LockedError: another process works in the run folder.
+        SystemExit: a signal ended the run; its state is saved.
     """
     first = plans[0]
     num_runs = sum(plan.num_seeds for plan in plans)
-    with Display(f"{first.config.method} {first.task}", first.config.num_iterations, first.cost_limit) as display:
+    title = f"{first.config.method} {first.task}"
+    with (
+        locking.hold(checkpoint_dir / ".run.lock"),
+        Display(title, first.config.num_iterations, first.cost_limit) as display,
+        Interruption() as interruption,
+    ):
         several = f"{len(plans)} configurations of " if len(plans) > 1 else ""
         display.message(
             f"{first.config.method} on {first.task}: {several}{first.num_seeds} seed(s), "
@@ -89,20 +105,23 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
         plans = [_with_earlier_commands(plan) for plan in plans]
         for plan in plans:
             run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
-        results, rate = _train(plans, env, checkpoint_dir, display)
+        results, rate = _train(plans, env, checkpoint_dir, display, interruption)
+        for plan, result in zip(plans, results, strict=True):
+            for seed in np.flatnonzero(result.stopped):
+                display.message(f"seed {seed} stopped: {faults.write(plan.folder, result, int(seed))}")
         display.message(f"evaluating {first.eval_episodes} episodes per seed ...")
         evaluations, random = _evaluate(plans, results, env)
-    return [
-        Outcome(
-            plan=plan,
-            result=result,
-            env=env,
-            evaluation=evaluated,
-            random=random,
-            summary=_finish(plan, result, rate, num_runs, evaluated, random),
-        )
-        for plan, result, evaluated in zip(plans, results, evaluations, strict=True)
-    ]
+        return [
+            Outcome(
+                plan=plan,
+                result=result,
+                env=env,
+                evaluation=evaluated,
+                random=random,
+                summary=_finish(plan, result, rate, num_runs, evaluated, random),
+            )
+            for plan, result, evaluated in zip(plans, results, evaluations, strict=True)
+        ]
 
 
 def _length(config: Config) -> str:
@@ -116,7 +135,7 @@ def _with_earlier_commands(plan: Plan) -> Plan:
 
 
 def _train(
-    plans: Sequence[Plan], env: Any, checkpoint_dir: Path, display: Display
+    plans: Sequence[Plan], env: Any, checkpoint_dir: Path, display: Display, interruption: Interruption
 ) -> tuple[list["Result"], float | None]:
     """The results, and environment steps per second of all runs, compilation aside (None if nothing was left to do)."""
     from ccil_jax import runner
@@ -126,6 +145,11 @@ def _train(
 
     with contextlib.ExitStack() as stack:
         writers = [stack.enter_context(run_folder.MetricsWriter(plan.folder)) for plan in plans]
+
+        def on_start(history: "History") -> None:
+            for writer, columns in zip(writers, own, strict=True):
+                writer.begin({name: rows[:, columns] for name, rows in history.items()})
+            interruption.defer()
 
         def on_progress(progress: "Progress") -> None:
             nonlocal steps, seconds
@@ -146,8 +170,14 @@ def _train(
             one_by_one=first.one_by_one,
             checkpoint_dir=checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
             resume=any(plan.resume for plan in plans),
+            on_start=on_start,
             on_progress=on_progress,
+            should_stop=interruption.requested,
         )
+    done = len(results[0].metrics["env_steps"])
+    interruption.settle(
+        f"stopped and saved after iteration {done} of {first.config.num_iterations}; continue with --resume"
+    )
     for plan, result in zip(plans, results, strict=True):
         if (directory := plan.folder / "checkpoints") != checkpoint_dir:
             runner.save(result, directory)

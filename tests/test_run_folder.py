@@ -34,14 +34,27 @@ def test_metrics_file_has_one_row_per_iteration_and_seed(tmp_path: Path) -> None
 
 
 def test_a_resumed_run_repeats_no_row(tmp_path: Path) -> None:
+    """Killed in the middle of a line, iterations after the last checkpoint, that of iteration 2."""
     with run_folder.MetricsWriter(tmp_path) as writer:
-        writer.write(4, metrics(4))  # killed after iteration 4, the last checkpoint being that of iteration 2
+        writer.begin({})
+        writer.write(4, metrics(4))
+    path = tmp_path / "metrics.csv"
+    whole = path.read_text()
+    path.write_text(whole[:-5])
     with run_folder.MetricsWriter(tmp_path) as writer:
+        writer.begin(metrics(2))
         writer.write(3, metrics(1, first=2))
         writer.write(4, metrics(1, first=3))
-    np.testing.assert_array_equal(run_folder.read_metrics(tmp_path)["env_steps"][:, 0], [100, 200, 300, 400])
-    with run_folder.MetricsWriter(tmp_path) as writer, pytest.raises(UsageError, match="columns differ"):
-        writer.write(3, metrics(1, first=2, kl=0.1))
+    assert path.read_text() == whole
+
+
+def test_counters_pass_31_bits(tmp_path: Path) -> None:
+    """Nine digits would do for float32, not for steps."""
+    with run_folder.MetricsWriter(tmp_path) as writer:
+        writer.begin({})
+        writer.write(1, {"env_steps": np.array([[2**31 + 1]])})
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,seed,env_steps", "1,0,2147483649"]
+    assert run_folder.read_metrics(tmp_path)["env_steps"].item() == 2**31 + 1
 
 
 @pytest.mark.parametrize("content", [None, "", "iteration,seed\n", "iteration,seed,x\n1,0,1\n1,1\n"])

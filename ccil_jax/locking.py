@@ -1,0 +1,33 @@
+"""One writer per folder: a lock that the operating system frees when its process ends, however it ends."""
+
+import contextlib
+import fcntl
+import os
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+
+from ccil_jax.config import ConfigError
+
+
+class LockedError(ConfigError):
+    """A folder that another process writes to. The message names both."""
+
+
+@contextlib.contextmanager
+def hold(path: Path) -> Iterator[None]:
+    """Holds the lock file `path`, which stays behind, unlocked. Raises `LockedError` at once if it is held."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            raise LockedError(
+                f"{path.parent}: in use by {holder}; wait for it, end it, or choose another folder"
+            ) from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {platform.node()}")
+        file.flush()
+        yield

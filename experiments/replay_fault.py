@@ -1,0 +1,69 @@
+"""Replays the iteration that stopped a seed, from the diagnostic file in its run folder, and names what went wrong."""
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.demonstrations import Demonstrations, load_demonstrations
+from ccil_jax.npz import ArchiveError
+from experiments import command_line, faults, run_folder
+from experiments.command_line import Parser, UsageError
+
+
+def make_parser() -> Parser:
+    """The options of this launcher."""
+    parser = Parser("replay_fault", __doc__ or "")
+    parser.add_argument("file", type=Path, metavar="FILE", help="fault_seed_N.npz of a run folder")
+    parser.add_argument("--demos", type=Path, metavar="FILE", help="where the demonstrations were moved to")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Prints what is not finite after the step; status 1 where the fault does not recur."""
+    try:
+        found = replay(arguments.file, arguments.demos)
+    except ArchiveError as error:
+        raise UsageError(str(error)) from None
+    print("\n".join(f"not finite: {name}" for name in found) or "every number is finite: the fault does not recur")
+    return 0 if found else 1
+
+
+def replay(path: Path, demos: Path | None = None) -> list[str]:
+    """One unguarded iteration from the state in `path`: names of the metrics and parts of the state not finite."""
+    text, cost_limit = faults.read_facts(path)
+    run = run_folder.parse_run(path, json.loads(text))
+    config = run.config.replace(cost_limit=None if math.isnan(cost_limit) else cost_limit)
+    demonstrations = _demonstrations(run.facts["demonstrations"], demos)
+
+    import jax
+
+    import envs
+    from ccil_jax import guard, on_policy, runner
+
+    env = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
+    agent = on_policy.make(config, env, runner.expert_data(demonstrations))
+    state = faults.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))
+    state, metrics = jax.jit(agent.step)(state)
+    return [*guard.not_finite({"metrics": metrics}), *guard.not_finite({"state": state})]
+
+
+def _demonstrations(facts: dict[str, Any] | None, path: Path | None) -> Demonstrations | None:
+    if facts is None:
+        return None
+    path = path or Path(facts["file"])
+    if not path.is_file() or run_folder.sha256(path) != facts["sha256"]:
+        raise UsageError(f"--demos {path}: not the file that the run began with; give that file")
+    return load_demonstrations(path).take_episodes(facts["num_episodes"])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
