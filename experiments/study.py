@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ccil_jax.versions import versions
 from experiments import command_line, run_folder, variants, workers
 from experiments.command_line import Parser, UsageError
 from experiments.variants import Program, Variant
@@ -68,7 +69,7 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
     num_runs = sum(variant.plan.num_seeds for variant in chosen)
     done = f", {len(programs)} of them unfinished" if arguments.resume else ""
     print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_programs)} programs{done}", flush=True)
-    facts = {"command": command_line.command(), "versions": run_folder.versions()}
+    facts = {"command": command_line.command(), "versions": versions()}
     run_folder.write_json(out / record, {**facts, "git_commit": run_folder.git_commit(), "choices": choices})
     for program in programs:
         variants.write_program(program)
