@@ -326,7 +326,7 @@ def make_walk(name: str, physics: str, max_episode_steps: int, **_: object) -> o
     from tests.probe_envs import Walk
 
     class Task(Walk):
-        physics_name = "probe"
+        physics_name = "native"
 
         def advance(self, physics: Any, action: Any) -> Any:
             physics, reward, cost, terminated = super().advance(physics, action)
