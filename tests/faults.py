@@ -27,13 +27,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 ROOT = Path(__file__).parent.parent
-METHODS = ("malm", "ccil", "gail", "expert")
+METHODS: tuple[str, ...] = ("malm", "ccil", "gail", "expert", "bc", "iq_learn")
 NUM_ITERATIONS = 40
 SECONDS_TO_LEAVE = 30.0
 OPTIONS = (
     f"--env Walk --env-steps {NUM_ITERATIONS * 64} --num-seeds 2 --seed 3 --eval-episodes 2 --max-episode-steps 7 "
     "--num-envs 4 --batch-size 32 --generator-steps 2 --hidden-sizes 4 --discriminator-minibatch-size 16 "
-    "--critic-minibatch-size 8 --critic-epochs 2 --fisher-stride 2"
+    f"--critic-minibatch-size 8 --critic-epochs 2 --fisher-stride 2 --bc-epochs {NUM_ITERATIONS}"
 ).split()
 
 

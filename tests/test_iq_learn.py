@@ -108,9 +108,9 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(whole: runner.Result, tmp
 
 def test_it_learns_from_every_step(whole: runner.Result) -> None:
     """20 iterations of 32 steps: as many updates, and the ring holds the last 64 true transitions."""
-    assert (np.asarray(whole.state.learner.policy_optimizer[0].count) == 20 * 32).all()
-    ring = jax.tree.map(lambda leaf: np.asarray(leaf[0]), whole.state.replay)
+    assert (np.asarray(whole.state.agent.learner.policy_optimizer[0].count) == 20 * 32).all()
+    ring = jax.tree.map(lambda leaf: np.asarray(leaf[0]), whole.state.agent.replay)
     assert ring.num_added == 20 * 32
     assert np.abs(ring.action).max() <= 1  # squashed into the range
     assert all(np.isfinite(rows).all() for rows in whole.metrics.values())
-    assert not same_bits(ring, jax.tree.map(lambda leaf: np.asarray(leaf[1]), whole.state.replay))
+    assert not same_bits(ring, jax.tree.map(lambda leaf: np.asarray(leaf[1]), whole.state.agent.replay))
