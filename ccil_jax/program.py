@@ -28,7 +28,7 @@ class Program:
 
     init: Callable[[jax.Array], GuardedState]  # keys [S] -> state
     state: GuardedState  # shapes, dtypes and shardings
-    # state (donated), and how many iterations (default: chunk_length) -> state, metrics [S, that many]
+    # state (donated), and how many iterations (default: chunk_length) -> state, metrics [S, chunk_length]; 0 after so many
     chunk: Callable[..., tuple[GuardedState, Metrics]]
     chunk_length: int  # the most
     compile_seconds: float
@@ -111,8 +111,7 @@ def compile_program(config: Config, env: Environment, expert: ExpertData | None,
 
     def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
         wanted = jax.device_put(np.int32(length), replicated)
-        state, metrics = compiled_chunk(config, expert, wanted, state)
-        return state, metrics if length == chunk_length else {k: v[:, :length] for k, v in metrics.items()}
+        return compiled_chunk(config, expert, wanted, state)
 
     return Program(
         init=lambda keys: compiled_init(config, expert, jax.device_put(keys, by_seed)),

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import METHOD_NAMES, PRESETS
+from ccil_jax.versions import versions
 from envs.registry import PHYSICS
 from experiments import command_line, devices, options, run_folder
 from experiments.command_line import Parser, UsageError
@@ -120,7 +121,7 @@ def run(arguments: argparse.Namespace) -> None:
     command_line.check_writable(arguments.out.parent, "--out")
     facts = {
         "command": command_line.command(),
-        "versions": run_folder.versions(),
+        "versions": versions(),
         "git_commit": run_folder.git_commit(),
         "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load_average": os.getloadavg(),

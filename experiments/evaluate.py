@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ccil_jax.versions import versions
 from envs.registry import TASKS
 from experiments import command_line, run_folder, summary
 from experiments.command_line import Parser, UsageError
@@ -100,7 +101,7 @@ def evaluate_run(stored: Run, arguments: argparse.Namespace) -> tuple[dict[str, 
     return {
         **settings,
         "command": command_line.command(),
-        "versions": run_folder.versions(),
+        "versions": versions(),
         "per_seed": rows,
         "aggregate": summary.aggregate_scores(rows),
     }, reference

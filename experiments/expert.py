@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.demonstrations import Demonstrations, save_demonstrations
+from ccil_jax.versions import versions
 from experiments import command_line, options, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.resuming import resumed
@@ -109,7 +110,7 @@ def record(outcome: Outcome, seed: int, num_trajectories: int) -> Demonstrations
         "evaluation": {k: row[k] for k in ("episode_return", "episode_cost", "episode_length")},
         "random_policy": {k: outcome.summary[f"random_{k}"] for k in ("return", "cost")},
         "command": plan.command,
-        "versions": run_folder.versions(),
+        "versions": versions(),
         "git_commit": run_folder.git_commit(),
     }
     return evaluation.record(

@@ -44,8 +44,8 @@ def read_state(path: Path, like: Any) -> Any:
         shape = jax.eval_shape(_numbers, leaf)
         if (value.shape, value.dtype) != (shape.shape, shape.dtype):
             raise npz.ArchiveError(f"{path}: '{name}' is {value.dtype}{value.shape}; use the version that wrote it")
-        is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        leaves.append(jax.random.wrap_key_data(value) if is_key else jax.numpy.asarray(value))
+        is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+        leaves.append(jax.random.wrap_key_data(jax.numpy.asarray(value)) if is_key else jax.numpy.asarray(value))
     return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
 

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 ROOT = Path(__file__).parent.parent
-METHODS = ("malm", "ccil", "gail", "expert")
+METHODS: tuple[str, ...] = ("malm", "ccil", "gail", "expert")
 NUM_ITERATIONS = 40
 SECONDS_TO_LEAVE = 30.0
 OPTIONS = (

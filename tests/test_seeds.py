@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ccil_jax import on_policy, runner
-from ccil_jax.on_policy import AgentState
+from ccil_jax.guard import GuardedState
 from ccil_jax.program import Program, compile_program
 from ccil_jax.types import Metrics
 from envs.base import State
@@ -70,7 +70,7 @@ def compiled() -> Compiled:
     return Compiled(program, listener.names, len(env.traces), env)
 
 
-def run(program: Program, keys: jax.Array) -> tuple[AgentState, list[Metrics]]:
+def run(program: Program, keys: jax.Array) -> tuple[GuardedState, list[Metrics]]:
     """Two chunks: 20 iterations."""
     state, history = program.init(keys), []
     for _ in range(2):
