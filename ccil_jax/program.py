@@ -28,7 +28,7 @@ class Program:
 
     init: Callable[[jax.Array], GuardedState]  # keys [S] -> state
     state: GuardedState  # shapes, dtypes and shardings
-    # state (donated), and how many iterations (default: chunk_length) -> state, metrics [S, chunk_length]; 0 after so many
+    # state (donated), how many iterations (default: chunk_length) -> state, metrics [S, chunk_length], 0 after these
     chunk: Callable[..., tuple[GuardedState, Metrics]]
     chunk_length: int  # the most
     compile_seconds: float
