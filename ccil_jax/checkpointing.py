@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -85,9 +86,9 @@ class Checkpointer:
             damaged = damaged or passed[0][1]
         if good is None and damaged is not None:
             raise CheckpointError(f"{damaged}; no other is intact: restore it from a copy, or begin a new run")
-        for folder, complaint in passed:
+        for folder, reason in passed:
             remedy = "starting over" if good is None else f"going on from step {good}"
-            _log.warning("warning: %s; %s", complaint, remedy)
+            _log.warning("warning: %s; %s", reason, remedy)
             self._set_aside(folder)
         return good
 
@@ -159,7 +160,7 @@ def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def _is_key(leaf: Any) -> bool:
-    return jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _is_disk_error(error: BaseException) -> bool:

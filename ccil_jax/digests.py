@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ccil_jax.config import Config, ConfigError
@@ -39,7 +40,7 @@ def _describe(leaf: Any) -> dict[str, Any]:
     facts = {"dtype": str(leaf.dtype), "shape": list(leaf.shape)}
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return facts
-    is_key = jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
     values = np.ascontiguousarray(jax.random.key_data(leaf) if is_key else leaf)
     return {**facts, "sha256": hashlib.sha256(values.tobytes()).hexdigest()}
 

@@ -34,7 +34,7 @@ class Program:
 
     init: Callable[[jax.Array], GuardedState]  # keys [R] -> state
     state: GuardedState  # shapes, dtypes and shardings
-    # state (donated), and how many iterations (default: chunk_length) -> state, metrics [R, that many]
+    # state (donated), how many iterations (default: chunk_length) -> state, metrics [R, chunk_length], 0 after these
     chunk: Callable[..., tuple[GuardedState, Metrics]]
     chunk_length: int  # the most
     compile_seconds: float
@@ -141,8 +141,7 @@ def compile_program(
 
     def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
         wanted = jax.device_put(np.int32(length), replicated)
-        state, metrics = compiled_chunk(config, expert, wanted, by_name, state)
-        return state, metrics if length == chunk_length else {k: v[:, :length] for k, v in metrics.items()}
+        return compiled_chunk(config, expert, wanted, by_name, state)
 
     return Program(
         init=lambda keys: compiled_init(config, expert, by_name, jax.device_put(keys, by_run)),

@@ -18,7 +18,7 @@ from ccil_jax.digests import CheckpointError
 from ccil_jax.guard import GuardedState
 from ccil_jax.program import Program, compile_program, make_agent
 from ccil_jax.rollout import Actor
-from ccil_jax.types import ExpertData, ExpertTransitions, Metrics
+from ccil_jax.types import ExpertData, ExpertTransitions
 from envs.base import Environment
 
 CHECKPOINT_SECONDS = 60.0  # about this much work is lost with a killed process
@@ -228,7 +228,8 @@ def train_runs(
             chunk_start = time.perf_counter()
             length = min(length, last - done)
             state, metrics = program.chunk(state, length)
-            rows = _rows(metrics, done, config)
+            # Cut on the host: a slice on the device would be compiled for every length.
+            rows = _rows({name: np.asarray(value)[:, :length] for name, value in metrics.items()}, done, config)
             stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
             elapsed = time.perf_counter() - chunk_start
             history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
@@ -336,9 +337,9 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     return Loaded(config=config, agent=saved["state"].actor)
 
 
-def _rows(metrics: Metrics, done: int, config: Config) -> History:
+def _rows(metrics: History, done: int, config: Config) -> History:
     """Metrics of a chunk [R, chunk] as rows [chunk, R], with the step counter."""
-    rows = {name: np.asarray(value).T for name, value in metrics.items()}
+    rows = {name: value.T for name, value in metrics.items()}
     length, num_runs = next(iter(rows.values())).shape
     # Counted on the host: a 32-bit counter would overflow.
     env_steps = np.arange(done + 1, done + length + 1, dtype=np.int64) * config.steps_per_iteration

@@ -29,7 +29,7 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Suite]:
 
 
 def test_killed_and_signalled_runs_end_as_undisturbed_ones(suite: Suite) -> None:
-    for row in (*suite.kills(2), *suite.signals(1)):
+    for row in (*suite.kills(1), *suite.signals(1)):
         assert row.survived == row.tried > 0, row
 
 
