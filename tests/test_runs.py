@@ -118,7 +118,7 @@ with quick_compilation():
     side_by_side = compile_program(shared, env, expert, 4, varied={k: v[:4] for k, v in varied.items()})
 expected, found = alone.chunk(alone.init(keys)), together.chunk(together.init(jax.numpy.tile(keys, 3)))
 print(json.dumps({
-    "devices": [len(program.state.key.sharding.device_set) for program in (alone, together, side_by_side)],
+    "devices": [len(program.state.agent.key.sharding.device_set) for program in (alone, together, side_by_side)],
     "same": [same_bits(expected, jax.tree.map(lambda leaf: leaf[i : i + 2], found)) for i in (0, 2, 4)],
     "collectives": [
         f"{name} of {i}" for name in ("all-reduce", "all-gather", "collective-permute", "all-to-all", "reduce-scatter")
