@@ -1,5 +1,6 @@
 """The folder of one training run: config, metrics, summary, checkpoints, figures, TensorBoard events."""
 
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -7,6 +8,7 @@ import json
 import math
 import os
 import subprocess
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -163,10 +165,12 @@ class MetricsWriter:
     """
 
     def __init__(self, folder: Path) -> None:
-        from tensorboardX import SummaryWriter  # here: it imports protobuf, which no argument error should wait for
+        # Here: it imports protobuf, which no argument error should wait for. Not `SummaryWriter`: its thread dies of a
+        # full disk in silence, and the training waits for it for ever.
+        from tensorboardX.event_file_writer import EventsWriter
 
         self.path = folder / "metrics.csv"
-        self._events: Any = SummaryWriter(logdir=str(folder))
+        self._events: Any = EventsWriter(str(folder / "events"))
         self._names: list[str] = []
 
     def begin(self, history: Mapping[str, np.ndarray]) -> None:
@@ -181,8 +185,12 @@ class MetricsWriter:
         """Adds rows `[chunk, num_seeds]`; `iteration` is the number of iterations finished with the chunk's last."""
         with self.path.open("a", newline="", encoding="utf-8") as file:
             rows = self._append(file, metrics, first=iteration - len(metrics["env_steps"]))
-        for row in rows:
-            self._write_events(row)
+        try:
+            for row in rows:
+                self._write_events(row)
+            self._events.flush()
+        except OSError as error:  # tensorboardX does not name the file
+            raise OSError(error.errno, error.strerror, str(self.path.parent)) from error
 
     def _append(self, file: TextIO, metrics: Mapping[str, np.ndarray], first: int) -> np.ndarray:
         writer = csv.writer(file, lineterminator="\n")
@@ -196,13 +204,15 @@ class MetricsWriter:
         return rows
 
     def _write_events(self, row: np.ndarray) -> None:
-        names = self._names
-        steps = int(row[0, names.index("env_steps")])
-        for i, name in enumerate(names):
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        steps, values = int(row[0, self._names.index("env_steps")]), []
+        for i, name in enumerate(self._names):
             if name != "env_steps":
-                self._events.add_scalar(f"mean/{name}", row[:, i].mean(), steps)
-                for seed, value in enumerate(row[:, i]):
-                    self._events.add_scalar(f"seed_{seed}/{name}", value, steps)
+                values.append(Summary.Value(tag=f"mean/{name}", simple_value=row[:, i].mean()))
+                values += [Summary.Value(tag=f"seed_{s}/{name}", simple_value=x) for s, x in enumerate(row[:, i])]
+        self._events.write_event(Event(wall_time=time.time(), step=steps, summary=Summary(value=values)))
 
     def __enter__(self) -> Self:
         return self
@@ -210,7 +220,8 @@ class MetricsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._events.close()
+        with contextlib.suppress(OSError):  # what `write` had to say of a full disk is said
+            self._events.close()
 
 
 def _text(value: float) -> str:

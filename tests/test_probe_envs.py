@@ -30,7 +30,7 @@ def fitted_values(**probe: Any) -> np.ndarray:
         critic_minibatch_size=32,
     )
     with quick_compilation():
-        state = runner.train(config, Sign(**probe), num_seeds=2).state
+        state = runner.train(config, Sign(**probe), num_seeds=2).state.agent
     critic = networks.make_scalar(config, 1)
     values = np.zeros((2, 2, 2))
     for seed in range(2):

@@ -1,6 +1,7 @@
 """The files of a run folder: one row per iteration and seed, strict JSON, nothing twice after a resumption."""
 
 import csv
+import errno
 import json
 from pathlib import Path
 
@@ -73,3 +74,15 @@ def test_json_is_strict_and_whole(tmp_path: Path) -> None:
         run_folder.write_json(path, {"a": object()})
     assert json.loads(path.read_text())["a"] == 0.5
     assert run_folder.git_commit() is None or len(run_folder.git_commit() or "") >= 40
+
+
+def test_a_full_disk_is_told_with_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with run_folder.MetricsWriter(tmp_path) as writer:
+        writer.begin({})
+        monkeypatch.setattr(writer._events, "write_event", full)
+        with pytest.raises(OSError, match="No space left") as caught:
+            writer.write(1, {"env_steps": np.full((1, 2), 64), "kl": np.zeros((1, 2))})
+    assert caught.value.filename == str(tmp_path)

@@ -138,7 +138,7 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(tmp_path: Path, capsys: py
     assert killer.killed is not None
     log = (out / "programs" / killer.killed / "worker.log").read_text()
     assert log.count("compiling ...") == 2  # two workers, of which
-    assert log.count("compiled in") == 1  # only the first had iterations left to do
+    assert 1 <= log.count("compiled in") <= 2  # the second had iterations left if the first died while it saved
 
     rows = (out / "sweep.csv").read_text().splitlines()
     assert len(rows) == 1 + 4
