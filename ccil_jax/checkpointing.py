@@ -4,10 +4,12 @@ Orbax commits a step by renaming a folder, so that a killed process leaves none 
 (flipped bits, other dtypes, a second writer, a disk that fills up behind its back) is what the manifests are for.
 """
 
+import contextlib
 import errno
 import logging
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +51,12 @@ class Checkpointer:
     ) -> None:
         self._directory = directory.resolve()  # orbax fails in the background on a relative path
         self._config, self._free, self._readonly = config, free | _FREE, readonly
-        options = ocp.CheckpointManagerOptions(
-            max_to_keep=None if readonly else KEPT, create=not readonly, read_only=readonly
-        )
         handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
-        self._manager = ocp.CheckpointManager(self._directory, options=options, item_handlers=handler)
+        with _warnings_of_orbax(logging.ERROR if readonly else logging.NOTSET):  # it warns of what was asked for
+            options = ocp.CheckpointManagerOptions(
+                max_to_keep=None if readonly else KEPT, create=not readonly, read_only=readonly
+            )
+            self._manager = ocp.CheckpointManager(self._directory, options=options, item_handlers=handler)
 
     def __enter__(self) -> "Checkpointer":
         return self
@@ -153,6 +156,17 @@ class Checkpointer:
     def close(self) -> None:
         """Frees the manager's threads. No save is in flight."""
         self._manager.close()
+
+
+@contextlib.contextmanager
+def _warnings_of_orbax(least: int) -> Iterator[None]:
+    logger = logging.getLogger("absl")
+    before = logger.level
+    logger.setLevel(max(before, least))
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
 
 
 def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
