@@ -142,12 +142,13 @@ def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tr
 
 def numbers(leaf: jax.Array) -> jax.Array:
     """The leaf itself, or the numbers behind a random key."""
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
+    return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
 def _like(leaf: jax.Array, plain: jax.Array) -> jax.Array:
-    return jax.random.wrap_key_data(plain, impl=jax.random.key_impl(leaf)) if _is_key(leaf) else plain
+    return jax.random.wrap_key_data(plain, impl=jax.random.key_impl(leaf)) if is_key(leaf) else plain
 
 
-def _is_key(leaf: jax.Array) -> bool:
+def is_key(leaf: Any) -> bool:
+    """Whether these are random keys, not numbers."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)

@@ -1,14 +1,13 @@
 """Replays the iteration that stopped a seed, from the diagnostic file in its run folder, and names what went wrong."""
 
 import argparse
-import json
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.demonstrations import Demonstrations, load_demonstrations
+from ccil_jax.files import file_sha256
 from ccil_jax.npz import ArchiveError
 from experiments import command_line, faults, run_folder
 from experiments.command_line import Parser, UsageError
@@ -34,18 +33,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 def replay(path: Path, demos: Path | None = None) -> list[str]:
     """One unguarded iteration from the state in `path`: names of the metrics and parts of the state not finite."""
-    text, cost_limit = faults.read_facts(path)
-    run = run_folder.parse_run(path, json.loads(text))
-    config = run.config.replace(cost_limit=None if math.isnan(cost_limit) else cost_limit)
+    run = run_folder.parse_run(path, faults.read_facts(path))
     demonstrations = _demonstrations(run.facts["demonstrations"], demos)
 
     import jax
 
     import envs
-    from ccil_jax import guard, on_policy, runner
+    from ccil_jax import agents, guard, runner
 
     env = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
-    agent = on_policy.make(config, env, runner.expert_data(demonstrations))
+    config = runner.resolve(run.config, env, demonstrations)
+    agent = agents.make(config, env, runner.expert_data(demonstrations))
     state = faults.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))
     state, metrics = jax.jit(agent.step)(state)
     return [*guard.not_finite({"metrics": metrics}), *guard.not_finite({"state": state})]
@@ -55,7 +53,7 @@ def _demonstrations(facts: dict[str, Any] | None, path: Path | None) -> Demonstr
     if facts is None:
         return None
     path = path or Path(facts["file"])
-    if not path.is_file() or run_folder.sha256(path) != facts["sha256"]:
+    if not path.is_file() or file_sha256(path) != facts["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run began with; give that file")
     return load_demonstrations(path).take_episodes(facts["num_episodes"])
 

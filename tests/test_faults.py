@@ -101,15 +101,28 @@ def test_nothing_needs_the_network(suite: Suite) -> None:
     assert faults.ending(folder) == suite.reference(SIMPLE)[0]
 
 
-def test_a_fault_is_diagnosed_and_replayed(suite: Suite) -> None:
-    """An environment whose cost is NaN stops every seed; the file in the run folder says why."""
+@pytest.mark.parametrize(
+    ("method", "options", "variables", "found"),
+    [
+        pytest.param(SIMPLE, (), {"FAULTY": "1"}, "metrics.cost_rate", id="on-policy"),
+        pytest.param("iq_learn", (), {"FAULTY": "1"}, "metrics.cost_rate", id="iq_learn"),
+        pytest.param("bc", ("--actor-learning-rate", "1e38"), {}, "metrics.loss", id="bc"),
+    ],
+)
+def test_a_fault_is_diagnosed_and_replayed(
+    suite: Suite, method: str, options: tuple[str, ...], variables: dict[str, str], found: str
+) -> None:
+    """A cost that is NaN, or a learning rate beyond all bounds, stops every seed; the file in the run folder says why.
+
+    The three are the kinds of agent, each with a state of its own.
+    """
     folder = suite.folder()
-    with suite.start(SIMPLE, folder, "--max-skipped-updates", "3", FAULTY="1") as process:
+    with suite.start(method, folder, "--max-skipped-updates", "3", *options, **variables) as process:
         error = process.communicate(timeout=300)[1]
     assert process.returncode == 1, error
     assert "seed 0 stopped" in error
     command = [sys.executable, faults.__file__, "--child", "replay_fault", str(folder / "fault_seed_0.npz")]
-    environment = {**suite.environment(), "FAULTY": "1"}
+    environment = {**suite.environment(), **variables}
     replayed = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert replayed.returncode == 0, replayed.stderr
-    assert "not finite: metrics.cost_rate" in replayed.stdout
+    assert f"not finite: {found}" in replayed.stdout
