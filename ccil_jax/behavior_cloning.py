@@ -27,7 +27,6 @@ class AgentState:
     held_out_loss: jax.Array  # [] theirs
     params: PyTree  # still training
     optimizer: PyTree
-    iteration: jax.Array  # [] int32
     key: jax.Array
 
 
@@ -57,7 +56,6 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             held_out_loss=jnp.asarray(jnp.inf),
             params=params,
             optimizer=optimizer.init(params),
-            iteration=jnp.zeros((), jnp.int32),
             key=key,
         )
 
@@ -82,7 +80,6 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             held_out_loss=jnp.minimum(held_out, state.held_out_loss),
             params=params,
             optimizer=optimizer_state,
-            iteration=state.iteration + 1,
             key=key,
         )
         entropy = distributions.entropy(Gaussian(mean=jnp.zeros(()), log_std=best["log_std"]))

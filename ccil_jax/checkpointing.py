@@ -14,19 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
 from ccil_jax import digests
 from ccil_jax.config import Config
 from ccil_jax.digests import CheckpointError, DamageError
+from ccil_jax.files import DISK_IS_FULL
 from ccil_jax.types import PyTree
+from envs.base import numbers
 
 KEPT = 2  # newest checkpoints that stay on disk
 _FREE = frozenset({"env_steps"})  # a finished run may be continued for longer
 _OVERHEAD = 2**20  # bytes of orbax's own files, at most
-_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _log = logging.getLogger(__name__)  # warnings go to stderr unless the program says otherwise
 
@@ -35,7 +35,7 @@ class Checkpointer:
     """Saves and restores one pytree per step under `directory`. Close it, or use it as a context manager.
 
     Args:
-        directory: made if need be. One writer at a time: hold its lock (`ccil_jax.locking`).
+        directory: made if need be. One writer at a time: hold its lock (`ccil_jax.files`).
         config: of the run; a step that was written under another is refused.
         free: further fields in which the configurations may differ.
         readonly: never touches what is there, so that a run can be read while it is written.
@@ -105,8 +105,7 @@ class Checkpointer:
 
     def save(self, step: int, state: PyTree) -> None:
         """Saves, and proves that it is on disk. Raises `CheckpointError` where the disk is full or fails."""
-        leaves = [jax.random.key_data(x) if _is_key(x) else x for x in jax.tree.leaves(state)]
-        needed = sum(leaf.nbytes for leaf in leaves) + _OVERHEAD
+        needed = sum(numbers(leaf).nbytes for leaf in jax.tree.leaves(state)) + _OVERHEAD
         free = shutil.disk_usage(self._directory).free
         folder = self._directory / str(step)
         if free < needed:
@@ -173,14 +172,10 @@ def _shape(leaf: Any) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
 
 
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
 def _is_disk_error(error: BaseException) -> bool:
-    if isinstance(error, OSError) and error.errno in _DISK:
+    if isinstance(error, OSError) and error.errno in DISK_IS_FULL:
         return True
-    return any(os.strerror(number) in str(error) or errno.errorcode[number] in str(error) for number in _DISK)
+    return any(os.strerror(number) in str(error) or errno.errorcode[number] in str(error) for number in DISK_IS_FULL)
 
 
 def _first_line(error: BaseException) -> str:

@@ -10,9 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 METHOD_NAMES = ("malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il", "bc", "iq_learn", "trpo", "expert")
-ADVERSARIAL_METHODS = frozenset(
-    {"malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il"}
-)  # those with a discriminator
+ADVERSARIAL_METHODS = frozenset({"malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il"})  # by a discriminator
 IMITATION_METHODS = ADVERSARIAL_METHODS | {"bc", "iq_learn"}
 PRESCRIBED_LIMIT_METHODS = frozenset({"lgail", "expert"})
 

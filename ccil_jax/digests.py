@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ccil_jax.config import Config, ConfigError
+from ccil_jax.files import file_sha256
 from ccil_jax.types import PyTree
 from ccil_jax.versions import versions
+from envs.base import numbers
 
 NAME = "manifest.json"
 
@@ -40,8 +41,7 @@ def _describe(leaf: Any) -> dict[str, Any]:
     facts = {"dtype": str(leaf.dtype), "shape": list(leaf.shape)}
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return facts
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    values = np.ascontiguousarray(jax.random.key_data(leaf) if is_key else leaf)
+    values = np.ascontiguousarray(numbers(leaf))
     return {**facts, "sha256": hashlib.sha256(values.tobytes()).hexdigest()}
 
 
@@ -52,7 +52,7 @@ def write(folder: Path, state: PyTree, config: Config | None) -> None:
         "versions": versions(),
         "device": jax.devices()[0].device_kind,
         "arrays": describe(state),
-        "files": {str(path.relative_to(folder)): _file_sha256(path) for path in _files(folder)},
+        "files": {str(path.relative_to(folder)): file_sha256(path) for path in _files(folder)},
     }
     temporary = folder / f".{NAME}.tmp"
     with temporary.open("w", encoding="utf-8") as file:
@@ -76,7 +76,7 @@ def read(folder: Path) -> dict[str, Any]:
     for name, expected in content["files"].items():
         if name not in present:
             raise DamageError(f"{folder / name}: missing")
-        if _file_sha256(present[name]) != expected:
+        if file_sha256(present[name]) != expected:
             raise DamageError(f"{folder / name}: damaged; it is not what was written")
     if strange := sorted(set(present) - set(content["files"])):
         raise DamageError(f"{folder / strange[0]}: was not there when the checkpoint was written")
@@ -115,11 +115,6 @@ def check_arrays(folder: Path, manifest: Mapping[str, Any], tree: PyTree) -> Non
 def _files(folder: Path) -> list[Path]:
     hidden = (NAME, f".{NAME}.tmp")
     return sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in hidden)
-
-
-def _file_sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _sha256(content: Mapping[str, Any]) -> str:

@@ -3,7 +3,6 @@
 A wrapper around an agent's step. Seeds are vmapped from outside, so what befalls one leaves the others' bits alone.
 """
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -13,7 +12,7 @@ from flax import struct
 from ccil_jax.on_policy import Agent
 from ccil_jax.rollout import Actor
 from ccil_jax.types import Metrics, PyTree
-from envs.base import compute_where
+from envs.base import compute_where, is_key
 
 # An engine's own state may hold infinities (MJX marks absent contacts so). What of it matters shows in the observation.
 UNCHECKED = "physics"
@@ -40,8 +39,6 @@ def protect(agent: Agent, max_skipped: int) -> Agent:
     Taken back means that everything is as before, bit for bit, but the random keys: the next step rolls other episodes.
     After `max_skipped` such steps in a row the seed stops in the state, with the key, that leads to the last of them:
     `agent.step` replays the fault. The metric `skipped_updates` counts them.
-
-    Fields of the state that `agent.bulk` names are neither checked nor held back.
     """
 
     def init(key: jax.Array) -> GuardedState:
@@ -52,34 +49,21 @@ def protect(agent: Agent, max_skipped: int) -> Agent:
         old = state.agent
         new, metrics = agent.step(old)
         alive = state.skipped_in_a_row < max_skipped
-        ok = all_finite(metrics) & stays_finite(_held(agent, old), _held(agent, new))
+        ok = all_finite(metrics) & stays_finite(old, new)
         fault = alive & ~ok
         in_a_row = jnp.where(alive & ok, 0, state.skipped_in_a_row + fault)
 
         def take_back(old: PyTree, new: PyTree) -> PyTree:
-            keys = jax.tree.map(lambda before, after: after if _is_key(before) else before, old, new)
+            keys = jax.tree.map(lambda before, after: after if is_key(before) else before, old, new)
             return jax.tree.map(lambda a, b: jnp.where(in_a_row < max_skipped, a, b), keys, old)
 
         # Almost never needed, so nothing is copied; and a step that no code follows rounds as it does unguarded.
-        before, after = _held(agent, old), _held(agent, new)
-        held = compute_where(~(alive & ok), take_back, after, before, after)
+        held = compute_where(~(alive & ok), take_back, new, old, new)
         skipped = state.skipped + fault
-        guarded = GuardedState(
-            agent=dataclasses.replace(new, **held) if agent.bulk else held["state"],
-            skipped=skipped,
-            skipped_in_a_row=in_a_row,
-        )
+        guarded = GuardedState(agent=held, skipped=skipped, skipped_in_a_row=in_a_row)
         return guarded, metrics | {"skipped_updates": skipped}
 
     return agent._replace(init=init, step=step)
-
-
-def _held(agent: Agent, state: PyTree) -> dict[str, PyTree]:
-    """What is checked and held back: the whole state, or its fields but the bulky ones."""
-    if not agent.bulk:
-        return {"state": state}
-    fields = {field.name for field in dataclasses.fields(state)} - agent.bulk
-    return {name: getattr(state, name) for name in sorted(fields)}
 
 
 def all_finite(tree: PyTree) -> jax.Array:
@@ -113,10 +97,6 @@ def not_finite(tree: PyTree) -> list[str]:
         for path, leaf in found
         if _is_float(leaf) and not bool(jnp.all(jnp.isfinite(leaf)))
     ]
-
-
-def _is_key(leaf: jax.Array) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _is_float(leaf: jax.Array) -> bool:

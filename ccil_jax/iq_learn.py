@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ccil_jax import distributions, networks, replay, rollout
 from ccil_jax.config import Config
 from ccil_jax.networks import Network, SquashedPolicy
-from ccil_jax.on_policy import Agent, EpisodeEstimates, estimate_episodes
+from ccil_jax.on_policy import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
 from ccil_jax.replay import Replay
 from ccil_jax.rollout import Actor, RolloutState
 from ccil_jax.types import ExpertData, Metrics, PyTree, Transition
@@ -228,14 +228,11 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
         state, (transition, metrics) = jax.lax.scan(act_and_learn, state, keys)
         estimates, finished = estimate_episodes(state.estimates, transition)
         iteration = state.iteration + 1
-        cost_rate = state.cost_rate + (jnp.mean(transition.cost) - state.cost_rate) / iteration
+        cost_rate = running_mean(state.cost_rate, jnp.mean(transition.cost), iteration)
         new = dataclasses.replace(state, estimates=estimates, cost_rate=cost_rate, iteration=iteration, key=key)
         return new, {
-            "episode_return": estimates.episode_return,
-            "episode_cost": estimates.episode_cost,
-            "episode_length": estimates.episode_length,
+            **episode_metrics(estimates, cost_rate),
             "episodes_finished": finished,
-            "cost_rate": cost_rate,
             **jax.tree.map(jnp.mean, metrics),
         }
 

@@ -30,7 +30,6 @@ class Agent(NamedTuple):
 
     init: Callable[[jax.Array], Any]  # key -> state
     step: Callable[[Any], tuple[Any, Metrics]]  # one iteration
-    bulk: frozenset[str] = frozenset()  # fields of the state that are too large for `guard` to check and hold back
 
 
 @struct.dataclass(kw_only=True)
@@ -155,13 +154,9 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
         constraint_state, constraint_metrics = constraint.update(state.constraint, cost_gap, outer)
 
         iteration = state.iteration + 1
-        mean_cost = jnp.mean(generator_metrics.pop("mean_cost"))
-        cost_rate = state.cost_rate + (mean_cost - state.cost_rate) / iteration
+        cost_rate = running_mean(state.cost_rate, jnp.mean(generator_metrics.pop("mean_cost")), iteration)
         metrics = {
-            "episode_return": state.estimates.episode_return,
-            "episode_cost": state.estimates.episode_cost,
-            "episode_length": state.estimates.episode_length,
-            "cost_rate": cost_rate,
+            **episode_metrics(state.estimates, cost_rate),
             "multiplier": constraint.multiplier(constraint_state),
             "entropy": distributions.entropy(
                 Gaussian(mean=jnp.zeros(()), log_std=state.actor.policy_params["log_std"])
@@ -195,6 +190,21 @@ def estimate_episodes(previous: EpisodeEstimates, transition: Transition) -> tup
         episode_cost=mean(transition.episode_cost, previous.episode_cost),
         episode_length=mean(transition.episode_length, previous.episode_length),
     ), count
+
+
+def running_mean(mean: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array:
+    """The mean of `count` values, of which `new` is the last and `mean` that of the others."""
+    return mean + (new - mean) / count
+
+
+def episode_metrics(estimates: EpisodeEstimates, cost_rate: jax.Array) -> Metrics:
+    """What every agent that acts reports."""
+    return {
+        "episode_return": estimates.episode_return,
+        "episode_cost": estimates.episode_cost,
+        "episode_length": estimates.episode_length,
+        "cost_rate": cost_rate,
+    }
 
 
 def episodes_of_steps(transition: Transition, limit: jax.Array, max_episode_steps: int) -> Episodes:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import guard, iq_learn, locking
+from ccil_jax import files, guard, iq_learn
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, field_names, validate
 from ccil_jax.demonstrations import Demonstrations
@@ -209,7 +209,7 @@ def train_runs(
     with contextlib.ExitStack() as stack:
         checkpoints = None
         if checkpoint_dir:
-            stack.enter_context(locking.hold(checkpoint_dir / ".writer.lock"))
+            stack.enter_context(files.hold(checkpoint_dir / ".writer.lock"))
             checkpoints = stack.enter_context(Checkpointer(checkpoint_dir, config))
         found = checkpoints.latest_step() if checkpoints and resume else None
         program = compile_program(

@@ -6,7 +6,6 @@ Nothing here imports JAX, so help and wrong input are answered at once.
 import argparse
 import datetime
 import difflib
-import errno
 import os
 import sys
 import tempfile
@@ -16,6 +15,7 @@ from typing import Any, NoReturn
 
 from ccil_jax.config import ConfigError
 from ccil_jax.demonstrations import DemonstrationsError
+from ccil_jax.files import DISK_IS_FULL
 
 MAX_ERROR = 1000  # characters of an error message, which may quote a file
 
@@ -68,7 +68,7 @@ def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None]
     except (UsageError, ConfigError, DemonstrationsError) as error:
         parser.error(str(error))
     except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        if error.errno not in DISK_IS_FULL:
             raise
         where = f"{error.filename}: " if error.filename else ""
         parser.error(f"{where}{error.strerror}; make space and continue with --resume")

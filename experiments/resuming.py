@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from ccil_jax.files import file_sha256
 from experiments import options, run_folder
 from experiments.command_line import UsageError
 
@@ -36,6 +37,6 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
             )
     # A file that was moved may be named again: its digest decides.
     path: Path | None = given.get("demos", Path(demos["file"]) if demos else None)
-    if path and path.is_file() and demos and run_folder.sha256(path) != demos["sha256"]:
+    if path and path.is_file() and demos and file_sha256(path) != demos["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")
     return {**saved, "env_steps": given.get("env_steps", saved["env_steps"]), "demos": path}

@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import dataclasses
-import hashlib
 import json
 import math
 import os
@@ -130,11 +129,6 @@ def _git(*arguments: str) -> str:
     command = ["git", *arguments]
     folder = Path(__file__).parent
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-
-
-def sha256(path: Path) -> str:
-    """Digest of a file's bytes, hexadecimal."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:

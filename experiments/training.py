@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccil_jax import locking
+from ccil_jax import files
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.files import file_sha256
 from experiments import devices, faults, run_folder, summary
 from experiments.interruption import Interruption
 from experiments.progress import Display
@@ -89,7 +90,7 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
     num_runs = sum(plan.num_seeds for plan in plans)
     title = f"{first.config.method} {first.task}"
     with (
-        locking.hold(checkpoint_dir / ".run.lock"),
+        files.hold(checkpoint_dir / ".run.lock"),
         Display(title, first.config.num_iterations, first.cost_limit) as display,
         Interruption() as interruption,
     ):
@@ -206,7 +207,7 @@ def _facts(plan: Plan, env: Any) -> dict[str, Any]:
     if plan.demonstrations is not None and plan.demonstrations_path is not None:
         demonstrations = {
             "file": str(plan.demonstrations_path.resolve()),
-            "sha256": run_folder.sha256(plan.demonstrations_path),
+            "sha256": file_sha256(plan.demonstrations_path),
             "num_episodes": plan.demonstrations.num_episodes,
         }
     device = jax.devices()[0]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ccil_jax.config import Config, field_names
+from ccil_jax.files import file_sha256
 from experiments import run_folder, train
 from experiments.command_line import Parser, UsageError
 from experiments.training import Plan
@@ -84,7 +85,7 @@ def check_unchanged(variant: Variant) -> None:
         if saved.get(name, value) != value:  # an older version may not say
             raise UsageError(f"--resume: {plan.folder} has {name} {saved[name]}, not {value}; choose another --out")
     demos = run.facts["demonstrations"]
-    if demos and plan.demonstrations_path and run_folder.sha256(plan.demonstrations_path) != demos["sha256"]:
+    if demos and plan.demonstrations_path and file_sha256(plan.demonstrations_path) != demos["sha256"]:
         raise UsageError(f"--resume: {plan.folder} began with other demonstrations than {plan.demonstrations_path}")
 
 

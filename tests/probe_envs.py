@@ -17,7 +17,7 @@ from ccil_jax import networks
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.types import Batch, PyTree
-from envs.base import State, first_state, next_state
+from envs.base import State, first_state, next_state, numbers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -256,8 +256,7 @@ def same_bits(a: PyTree, b: PyTree) -> bool:
     """Whether two pytrees have the same structure and the same bits in every leaf."""
 
     def data(x: Any) -> np.ndarray:
-        is_key = isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        return np.asarray(jax.random.key_data(x) if is_key else x)
+        return np.asarray(numbers(x) if isinstance(x, jax.Array) else x)
 
     if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
         return False

@@ -29,7 +29,7 @@ ORDER = (
     "hdf5",
     "formats",
     "config",
-    "locking",
+    "files",
     "versions",
     "types",
     "distributions",

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import checkpointing, digests, locking
+from ccil_jax import checkpointing, digests, files
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import Config
 from ccil_jax.digests import CheckpointError
-from ccil_jax.locking import LockedError
+from ccil_jax.files import LockedError
 from tests.probe_envs import same_bits
 
 CONFIG = Config(cost_limit=1.0)
@@ -181,14 +181,14 @@ def test_two_writers_are_refused_and_a_killed_one_is_not(tmp_path: Path) -> None
     path = tmp_path / "run.lock"
     code = (
         f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent.parent)!r})\n"
-        "from ccil_jax import locking\n"
-        f"with locking.hold(pathlib.Path({str(path)!r})): print('held', flush=True); sys.stdin.read()"
+        "from ccil_jax import files\n"
+        f"with files.hold(pathlib.Path({str(path)!r})): print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout and other.stdout.readline() == "held\n"
-        with pytest.raises(LockedError, match=f"in use by process {other.pid} on "), locking.hold(path):
+        with pytest.raises(LockedError, match=f"in use by process {other.pid} on "), files.hold(path):
             pass
         other.kill()
-    with locking.hold(path), pytest.raises(LockedError), locking.hold(path):
+    with files.hold(path), pytest.raises(LockedError), files.hold(path):
         pass

@@ -11,6 +11,7 @@ import pytest
 
 from ccil_jax.config import PRESETS, Config
 from ccil_jax.demonstrations import load_demonstrations
+from ccil_jax.files import file_sha256
 from experiments import evaluate, expert, options, run_folder, train
 from experiments.command_line import Parser
 
@@ -113,7 +114,7 @@ def test_train_writes_the_run_folder(pipeline: Path, capsys: pytest.CaptureFixtu
     assert names == {"config.json", "metrics.csv", "summary.json", "checkpoints", "figures", "events"}
     run = run_folder.read_run(folder)
     assert run.config.method == "malm"
-    assert run.facts["demonstrations"]["sha256"] == run_folder.sha256(pipeline / "expert.npz")
+    assert run.facts["demonstrations"]["sha256"] == file_sha256(pipeline / "expert.npz")
     rows = run_folder.read_metrics(folder)
     assert rows["env_steps"].tolist() == [[120.0, 120.0], [240.0, 240.0]]
     assert {"cost_rate", "multiplier", "meta_gradient", "discriminator_accuracy_held_out"} <= set(rows)

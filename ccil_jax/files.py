@@ -1,13 +1,17 @@
-"""One writer per folder: a lock that the operating system frees when its process ends, however it ends."""
+"""Files and folders: who writes, what was written, and that the disk is full."""
 
 import contextlib
+import errno
 import fcntl
+import hashlib
 import os
 import platform
 from collections.abc import Iterator
 from pathlib import Path
 
 from ccil_jax.config import ConfigError
+
+DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # or a quota, or the largest file that may be
 
 
 class LockedError(ConfigError):
@@ -16,7 +20,10 @@ class LockedError(ConfigError):
 
 @contextlib.contextmanager
 def hold(path: Path) -> Iterator[None]:
-    """Holds the lock file `path`, which stays behind, unlocked. Raises `LockedError` at once if it is held."""
+    """Holds the lock file `path`, which stays behind, unlocked. Raises `LockedError` at once if it is held.
+
+    The operating system frees the lock when the process ends, however it ends.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as file:
         try:
@@ -31,3 +38,9 @@ def hold(path: Path) -> Iterator[None]:
         file.write(f"process {os.getpid()} on {platform.node()}")
         file.flush()
         yield
+
+
+def file_sha256(path: Path) -> str:
+    """Digest of a file's bytes, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
