@@ -87,7 +87,9 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         and demonstrations.num_steps == len(demonstrations.episode_ends)
         and not demonstrations.terminated.any()
     ):
-        raise ConfigError("demonstrations: every trajectory is one step long and cut off, so no step's successor is known")
+        raise ConfigError(
+            "demonstrations: every trajectory is one step long and cut off, so no step's successor is known"
+        )
     if config.method == "iq_learn" and config.temperature is None:
         config = config.replace(temperature=iq_learn.TEMPERATURES.get(env.name, iq_learn.USUAL_TEMPERATURE))
     validate(config)

@@ -130,16 +130,23 @@ def step(
 
     Returns:
         The first candidate that is finite, within the radius and no worse, or `params` bit for bit; its fraction (0 if
-        none, or if the directions cancel); metrics `kl`, `surrogate` (the objective's improvement) and `step_fraction`.
+        none, or if the directions cancel); metrics `kl`, `surrogate` (the objective's improvement) and `step_fraction`,
+        and why there was no step, one of four that is 1: `rejected_not_finite`, `rejected_by_kl` or
+        `rejected_by_surrogate`, by what was wrong with the last candidate, or `no_direction`.
     """
     before = weights @ evaluate(params)[0]
+
+    def finite(candidate: jax.Array, gain: jax.Array, kl: jax.Array) -> jax.Array:
+        return jnp.isfinite(gain) & jnp.isfinite(kl) & jnp.all(jnp.isfinite(candidate))
+
+    def within(kl: jax.Array) -> jax.Array:
+        return kl <= kl_tolerance * max_kl
 
     def attempt(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         candidate = propose(params, along, weights, max_kl, 0.5**index)
         objectives, kl = evaluate(candidate)
         gain = weights @ objectives - before
-        finite = jnp.isfinite(gain) & jnp.isfinite(kl) & jnp.all(jnp.isfinite(candidate))
-        return candidate, gain, kl, finite & (kl <= kl_tolerance * max_kl) & (gain >= 0)
+        return candidate, gain, kl, finite(candidate, gain, kl) & within(kl) & (gain >= 0)
 
     def unfinished(carry: Search) -> jax.Array:
         index, _, _, _, accepted = carry
@@ -153,8 +160,17 @@ def step(
     start = (jnp.zeros((), jnp.int32), params, zero, zero, jnp.zeros((), bool))
     tried, candidate, gain, kl, accepted = jax.lax.while_loop(unfinished, shrink, start)
     # Directions that cancel are accepted as a step of nothing: that counts as no step.
-    fraction = jnp.where(accepted & jnp.any(candidate != params), 0.5 ** (tried - 1.0), 0.0)
+    moved = accepted & jnp.any(candidate != params)
+    fraction = jnp.where(moved, 0.5 ** (tried - 1.0), 0.0)
+    sound = finite(candidate, gain, kl)
+    reasons = {
+        "rejected_not_finite": ~accepted & ~sound,
+        "rejected_by_kl": ~accepted & sound & ~within(kl),
+        "rejected_by_surrogate": ~accepted & sound & within(kl),
+        "no_direction": accepted & ~moved,
+    }
     metrics = {
+        **{name: jnp.asarray(reason, params.dtype) for name, reason in reasons.items()},
         "kl": jnp.where(accepted, kl, 0.0),
         "surrogate": jnp.where(accepted, gain, 0.0),
         "step_fraction": fraction,

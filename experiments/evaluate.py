@@ -33,7 +33,12 @@ def make_parser() -> Parser:
         "--seed", default=1, type=command_line.natural, metavar="N", help="of the episodes (default: 1)"
     )
     parser.add_argument(
-        "--export", type=Path, metavar="FILE", help="also write the policies and these episodes as NumPy arrays (.npz)"
+        "--export",
+        nargs="+",
+        default=[],
+        type=Path,
+        metavar="FILE",
+        help="also write the policies: with these episodes as NumPy arrays (.npz), or as a program (.stablehlo)",
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="result file (default: RUN_DIR/evaluation.json)")
     return parser
@@ -49,8 +54,10 @@ def run(arguments: argparse.Namespace) -> None:
         raise UsageError(f"RUN_DIR {arguments.run}: holds no checkpoint; train first, or resume with `train --resume`")
     path = arguments.out or arguments.run / "evaluation.json"
     command_line.check_writable(path.parent, "--out")
-    if arguments.export:
-        command_line.check_writable(arguments.export.parent, "--export")
+    for file in arguments.export:
+        if file.suffix not in (".npz", ".stablehlo"):
+            raise UsageError(f"--export {file}: unknown kind of file; end its name with .npz or .stablehlo")
+        command_line.check_writable(file.parent, "--export")
     if arguments.simulator == "original" and TASKS[stored.facts["task"]].family == "safety_gym":
         raise UsageError(
             "--simulator original: safety-gymnasium needs an environment of its own; use --export FILE and run there "
@@ -71,7 +78,7 @@ def evaluate_run(stored: Run, arguments: argparse.Namespace) -> tuple[dict[str, 
     """Runs the episodes. Returns the content of the result file and the levels to compare with."""
     import envs  # imports JAX: not before the input has been checked
     from ccil_jax import evaluation, runner
-    from experiments import original
+    from experiments import exporting, original
 
     env = envs.make(stored.facts["task"], physics=stored.facts["physics"], **stored.facts["env_options"])
     loaded = runner.load(stored.config, env, stored.folder.resolve() / "checkpoints", stored.facts["num_seeds"])
@@ -85,10 +92,13 @@ def evaluate_run(stored: Run, arguments: argparse.Namespace) -> tuple[dict[str, 
     else:
         contact_cost = stored.facts["env_options"]["contact_cost"]
         evaluated = original.evaluate(loaded.config, loaded.agent, env, contact_cost=contact_cost, **settings)
-    if arguments.export:
-        facts = {"task": env.name, "original": TASKS[env.name].original, "simulator": arguments.simulator, **settings}
-        original.export(arguments.export, loaded.config, loaded.agent, env, evaluated, facts)
-        print(f"policies {arguments.export}")
+    facts = {"task": env.name, "original": TASKS[env.name].original, "simulator": arguments.simulator, **settings}
+    for file in arguments.export:
+        if file.suffix == ".npz":
+            exporting.export_numpy(file, loaded.config, loaded.agent, env, evaluated, facts)
+        else:
+            exporting.export_stablehlo(file, loaded.config, loaded.agent, env)
+        print(f"policies {file}")
     random = evaluation.random_policy(env, num_episodes=arguments.episodes, seed=arguments.seed)
     reference = summary.Reference(
         expert_return=stored.facts["expert_return"],

@@ -4,14 +4,11 @@ Reward and cost follow the task's rule (`envs.locomotion`), fed with the reward 
 """
 
 import dataclasses
-import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ccil_jax import npz
 from ccil_jax.config import Config
 from envs.registry import TASKS
 
@@ -129,29 +126,6 @@ def evaluate(
     simulator.close()
     totals = np.array(results).reshape(len(learnt), num_episodes, 3)
     return Totals(totals[..., 0], totals[..., 1], totals[..., 2])
-
-
-def export(path: Path, config: Config, actor: Any, env: Any, evaluation: Any, facts: dict[str, Any]) -> None:
-    """Writes every seed's policy as NumPy arrays [num_seeds]-leading, with what it achieved here.
-
-    Args:
-        path: an `.npz` file.
-        config: for the activation.
-        actor: [num_seeds]-leading.
-        env: for the range of actions.
-        evaluation: `episode_return` and `episode_cost`, [num_seeds, num_episodes] each.
-        facts: more metadata, to be written as JSON.
-    """
-    import jax
-
-    arrays = jax.tree.map(lambda *seeds: np.stack(seeds), *[policy.arrays() for policy in policies(config, actor, env)])
-    metadata = facts | {"activation": config.activation}
-    npz.write(
-        path,
-        arrays
-        | {name: np.asarray(getattr(evaluation, name)) for name in ("episode_return", "episode_cost")}
-        | {"metadata": np.array(json.dumps(metadata))},
-    )
 
 
 def make_simulator(env: Any) -> Any:

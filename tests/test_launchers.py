@@ -141,6 +141,52 @@ def test_evaluate_agrees_with_the_original_simulator(pipeline: Path, capsys: pyt
     assert "seed 1" in capsys.readouterr().out
 
 
+def test_exported_policies_are_the_learnt_ones(
+    pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """1,000 observations: the program to the last bit, the NumPy arrays to 1e-5."""
+    import jax
+    import jax.numpy as jnp
+
+    import envs
+    from ccil_jax import networks, runner
+    from ccil_jax.rollout import act
+    from experiments.original import policies
+
+    files = [str(tmp_path / name) for name in ("policy.npz", "policy.stablehlo")]
+    assert evaluate.main([f"{pipeline}/malm", "--episodes", "2", "--export", *files]) == 0
+    said = capsys.readouterr().out
+    assert all(f"policies {file}" in said for file in files)
+    stored = run_folder.read_run(pipeline / "malm")
+    env = envs.make("Swimmer", **stored.facts["env_options"])
+    loaded = runner.load(stored.config, env, stored.folder / "checkpoints", num_seeds=2)
+    random = np.random.default_rng(0)
+    obs = random.normal(0, 3, (1000, env.obs_dim)).astype(np.float32)
+    noise = random.standard_normal((1000, env.action_dim)).astype(np.float32)
+
+    program = jax.export.deserialize(bytearray(Path(files[1]).read_bytes()))
+    policy = networks.policy_of(stored.config, env)
+
+    @jax.jit
+    def learnt(obs: jax.Array, noise: jax.Array) -> jax.Array:
+        return jax.vmap(lambda actor: act(policy.apply, actor, obs, noise))(loaded.agent)
+
+    expected = np.asarray(learnt(jnp.asarray(obs), jnp.asarray(noise)))
+    assert expected.shape == (2, 1000, env.action_dim)
+    np.testing.assert_array_equal(program.call(obs, noise), expected)
+    assert program.call(obs[:7], noise[:7]).shape == (2, 7, env.action_dim)
+
+    modes = np.stack([[one.mode(x) for x in obs] for one in policies(stored.config, loaded.agent, env)])
+    np.testing.assert_allclose(modes, program.call(obs, 0 * noise), rtol=0, atol=1e-5)
+    with np.load(files[0], allow_pickle=False) as arrays:
+        assert arrays["kernel_0"].shape == (2, env.obs_dim, *stored.config.hidden_sizes[:1])
+
+    with pytest.raises(SystemExit) as end:
+        evaluate.main([f"{pipeline}/malm", "--export", "policy.onnx"])
+    assert end.value.code == 2
+    assert "--export policy.onnx: unknown kind of file" in capsys.readouterr().err
+
+
 def test_numpy_policy_is_the_learnt_policy() -> None:
     import jax
     import jax.numpy as jnp

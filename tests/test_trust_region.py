@@ -248,23 +248,33 @@ def within(limit: float, inside: Any, outside: Any) -> Callable[[jax.Array], tup
     return evaluate
 
 
+REASONS = ("rejected_not_finite", "rejected_by_kl", "rejected_by_surrogate", "no_direction")
+
+
+def no_step(reason: str) -> dict[str, float]:
+    """The metrics of standing still."""
+    return {"kl": 0.0, "surrogate": 0.0, "step_fraction": 0.0, **dict.fromkeys(REASONS, 0.0), reason: 1.0}
+
+
 @pytest.mark.parametrize(
-    "outcome",
+    ("outcome", "reason"),
     [
-        pytest.param((np.nan, 0.0), id="objective NaN"),
-        pytest.param((np.inf, 0.0), id="objective infinite"),
-        pytest.param((-np.inf, 0.0), id="objective minus infinity"),
-        pytest.param((1.0, np.nan), id="KL NaN"),
-        pytest.param((1.0, np.inf), id="KL infinite"),
-        pytest.param((1.0, 0.75001), id="KL never within"),
-        pytest.param((-1e-6, 0.0), id="objective falls"),
+        pytest.param((np.nan, 0.0), "rejected_not_finite", id="objective NaN"),
+        pytest.param((np.inf, 0.0), "rejected_not_finite", id="objective infinite"),
+        pytest.param((-np.inf, 0.0), "rejected_not_finite", id="objective minus infinity"),
+        pytest.param((1.0, np.nan), "rejected_not_finite", id="KL NaN"),
+        pytest.param((1.0, np.inf), "rejected_not_finite", id="KL infinite"),
+        pytest.param((1.0, 0.75001), "rejected_by_kl", id="KL never within"),
+        pytest.param((-1e-6, 0.0), "rejected_by_surrogate", id="objective falls"),
     ],
 )
-def test_a_step_that_nothing_accepts_leaves_the_parameters_bit_for_bit(outcome: tuple[float, float]) -> None:
+def test_a_step_that_nothing_accepts_leaves_the_parameters_bit_for_bit(
+    outcome: tuple[float, float], reason: str
+) -> None:
     new, fraction, metrics = step(within(0.0, outcome, outcome), DELICATE)
     assert same_bits(new, DELICATE)
     assert fraction == 0
-    assert metrics == {"kl": 0.0, "surrogate": 0.0, "step_fraction": 0.0}
+    assert metrics == no_step(reason)
 
 
 @pytest.mark.parametrize("outside", [(np.nan, 0.0), (1.0, np.nan), (1.0, 9.0), (-1.0, 0.0), (np.inf, np.inf)])
@@ -273,6 +283,7 @@ def test_candidates_are_halved_until_one_is_sound(outside: tuple[float, float]) 
     assert fraction == 0.25
     np.testing.assert_allclose(new, START + np.array([0.25, 0, 0]), rtol=1e-6)
     np.testing.assert_allclose([metrics["kl"], metrics["surrogate"]], [0.7499, 1.0], rtol=1e-6)
+    assert not any(metrics[reason] for reason in REASONS)
 
 
 def test_the_last_candidate_is_the_ninth_halving() -> None:
@@ -298,7 +309,7 @@ def test_a_non_finite_sample_leaves_the_policy_bit_for_bit(field: str, value: fl
     new, taken, metrics = _improve_batch(problem.training.replace(**{field: bad}))
     assert same_bits(new, problem.params)
     assert taken.fraction == 0
-    assert metrics["kl"] == metrics["surrogate"] == metrics["step_fraction"] == 0
+    assert {name: metrics[name] for name in no_step("kl")} == no_step("rejected_not_finite")
 
 
 @functools.cache
@@ -345,6 +356,14 @@ def test_a_zero_gradient_gives_a_zero_step() -> None:
     start = jnp.asarray(START)
     along = trust_region.directions(matrix_product(np.eye(3, dtype=np.float32)), jnp.zeros((2, 3)), 10)
     np.testing.assert_array_equal(trust_region.propose(start, along, jnp.array([1.0, -2.0]), 0.01, 1.0), START)
+    nothing = Directions(x=jnp.zeros((1, 3)), gram=jnp.zeros((1, 1)))
+    always = within(np.inf, (1.0, 0.0), (1.0, 0.0))
+    new, fraction, metrics = trust_region.step(
+        start, nothing, jnp.ones(1), always, max_kl=0.5, kl_tolerance=1.5, num_halvings=3
+    )
+    assert same_bits(new, START)
+    assert fraction == 0
+    assert metrics == no_step("no_direction")
 
 
 def test_the_length_of_a_step_is_the_radius_whatever_the_scale_of_the_weights() -> None:
