@@ -39,6 +39,14 @@ test: lint types ## set up, then lint, check types and run the tests
 test-slow: $(VENV)/.dev ## the tests marked slow (long compilations and trainings)
 	$(RUN) pytest -n $(JOBS) --maxprocesses=8 -m slow $(PYTEST_ARGS)
 
+.PHONY: test-lowest
+test-lowest: ## the tests with the lowest versions that pyproject.toml allows, in an environment of their own
+	"$(PYTHON)" -m venv --clear "$(VENV)-lowest"
+	"$(VENV)-lowest/bin/python" -m pip install --quiet --disable-pip-version-check uv
+	"$(VENV)-lowest/bin/python" -m uv pip install --python "$(VENV)-lowest/bin/python" --resolution lowest-direct \
+	  --editable ".[dev]"
+	"$(VENV)-lowest/bin/python" -m pytest -n $(JOBS) --maxprocesses=8 $(PYTEST_ARGS)
+
 .PHONY: lint
 lint: $(VENV)/.dev ## style
 	$(RUN) ruff check .
@@ -58,7 +66,7 @@ setup: $(VENV)/.dev ## the environment alone, with everything that the checks ne
 
 .PHONY: clean
 clean: ## remove the environment, caches and builds; runs/ stays
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist MUJOCO_LOG.TXT
+	rm -rf $(VENV) $(VENV)-lowest .mypy_cache .pytest_cache .ruff_cache .hypothesis build dist MUJOCO_LOG.TXT
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Stamps: made once, and again when the dependencies may have changed.
