@@ -1,7 +1,10 @@
 """The physics backends: bits, purity, vmapping, divergence, and MJX against C MuJoCo."""
 
+import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +15,7 @@ import pytest
 
 import envs
 from envs.locomotion import load_model
-from envs.physics import make_physics
+from envs.physics import foreign, make_physics
 from envs.physics.bits import float64_bits
 from envs.physics.native import NativePhysics
 
@@ -122,12 +125,12 @@ def test_change_keeps_its_precision_far_from_the_origin(cheetah: NativePhysics) 
 
 def test_init_calls_no_engine_unless_derived_arrays_are_asked_for(cheetah: NativePhysics) -> None:
     arguments = jnp.zeros(9), jnp.zeros(9)
-    assert "callback" not in str(jax.make_jaxpr(cheetah.init)(*arguments))
+    assert "ffi_call" not in str(jax.make_jaxpr(cheetah.init)(*arguments))
     derived = make_physics("native", load_model("half_cheetah.xml"), num_substeps=5, fields=["xpos"])
-    assert "callback" in str(jax.make_jaxpr(derived.init)(*arguments))
+    assert "ffi_call" in str(jax.make_jaxpr(derived.init)(*arguments))
 
 
-def test_both_kinds_of_host_call_agree(cheetah: NativePhysics, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_kinds_of_call_agree(cheetah: NativePhysics, monkeypatch: pytest.MonkeyPatch) -> None:
     """On an accelerator the arguments come by value, through `jax.pure_callback`."""
     qpos, qvel, ctrl = starts(6, 9)
 
@@ -135,11 +138,70 @@ def test_both_kinds_of_host_call_agree(cheetah: NativePhysics, monkeypatch: pyte
         return cheetah.step(cheetah.init(qpos, qvel), ctrl)
 
     arguments = [x.reshape(2, 3, -1) for x in (qpos, qvel, ctrl)]
-    in_place = jax.jit(jax.vmap(jax.vmap(step)))(*arguments)
+    by_xla = jax.jit(jax.vmap(jax.vmap(step)))(*arguments)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert "pure_callback" in str(jax.make_jaxpr(jax.vmap(step))(qpos, qvel, ctrl))
     by_value = jax.jit(jax.vmap(jax.vmap(lambda *x: step(*x))))(*arguments)
-    jax.tree.map(np.testing.assert_array_equal, in_place, by_value)
+    jax.tree.map(np.testing.assert_array_equal, by_xla, by_value)
+
+
+def test_more_sizes_of_batches_than_an_engine_keeps(cheetah: NativePhysics) -> None:
+    """Those that are idle make room, and the results do not depend on it."""
+    qpos, qvel, ctrl = starts(foreign._POOL_SIZE + 3, 9)
+    bits = np.asarray(jax.vmap(cheetah.init)(qpos, qvel).backend)
+    engine, ctrl = cheetah._engine, ctrl.astype(np.float32)
+    together = engine._on_host(False, bits, ctrl)
+    for _ in range(2):
+        for size in range(1, len(bits)):
+            alone = engine._on_host(False, bits[:size], ctrl[:size])
+            np.testing.assert_array_equal(alone[0], together[0][:size])
+            np.testing.assert_array_equal(alone[1], together[1][:size])
+
+
+def test_programs_on_several_threads_share_an_engine(cheetah: NativePhysics) -> None:
+    """Each call has a batch of its own, whatever the others do meanwhile."""
+    qpos, qvel, ctrl = starts(8, 9)
+    data = jax.vmap(cheetah.init)(qpos, qvel)
+
+    @jax.jit
+    def walk(data: object, scale: float) -> object:
+        return jax.lax.scan(lambda d, _: (jax.vmap(cheetah.step)(d, ctrl * scale), None), data, None, 200)[0]
+
+    scales = [0.1 * i for i in range(8)]
+    expected = [walk(data, scale) for scale in scales]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda scale: jax.block_until_ready(walk(data, scale)), scales))
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
+CACHED = """
+import sys, jax, envs
+hits = []
+jax.config.update("jax_compilation_cache_dir", sys.argv[1])
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+jax.monitoring.register_event_listener(lambda event, **_: hits.append(event))
+env = envs.make(sys.argv[2])
+keys = jax.random.split(jax.random.key(0), 3)
+start = jax.jit(jax.vmap(env.reset))(keys)
+hits.clear()
+state = jax.jit(jax.vmap(lambda s: env.step(s, jax.numpy.ones(env.action_dim) / 3)))(start)
+print(hits.count("/jax/compilation_cache/cache_hits"), jax.device_get(state.obs).tobytes().hex())
+"""
+
+
+@pytest.mark.parametrize("task", ["Swimmer", "PointGoal1"])
+def test_a_program_with_physics_is_kept_for_the_next_process(task: str, tmp_path: Path) -> None:
+    """No address of this process is in it: another finds it in the cache, and gets the same numbers."""
+    environment = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "true"}
+    command = [sys.executable, "-c", CACHED, str(tmp_path), task]
+    runs = [
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+        for _ in range(2)
+    ]
+    assert runs[0][0] == "0"
+    assert int(runs[1][0]) >= 1
+    assert runs[0][1] == runs[1][1]
 
 
 def test_native_with_x64(cheetah: NativePhysics) -> None:
@@ -153,7 +215,7 @@ def test_native_with_x64(cheetah: NativePhysics) -> None:
     np.testing.assert_array_equal(single.qpos, double.qpos.astype(np.float32))
 
 
-@pytest.mark.parametrize("field", ["xpos", "cfrc_ext"])  # one from each engine
+@pytest.mark.parametrize("field", ["xpos", "cfrc_ext"])  # with and without the post-constraint pass
 def test_derived_fields_are_those_of_c_mujoco(field: str) -> None:
     model = load_model("half_cheetah.xml")
     physics = make_physics("native", model, num_substeps=5, fields=[field, "cvel"], track=["xipos"])
@@ -174,7 +236,7 @@ def test_derived_fields_are_those_of_c_mujoco(field: str) -> None:
         np.testing.assert_array_equal(after.change["xipos"][i], (reference.xipos - before).astype(np.float32))
 
 
-@pytest.mark.parametrize("fields", [[], ["cfrc_ext"]])  # one from each engine
+@pytest.mark.parametrize("fields", [[], ["cfrc_ext"]])  # with and without the post-constraint pass
 def test_divergence_gives_nan_and_spares_the_neighbours(
     fields: list[str], tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,11 +4,8 @@ The engine's float64 state travels through JAX as its bits (`bits.py`), so nothi
 hides in the engine: a step is a function of its arguments alone, and replays of a recorded run are exact.
 """
 
-import contextlib
-import dataclasses
 import os
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,21 +13,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.typing import ArrayLike
-from mujoco.batch import SimulationError
 
 from envs.physics.base import Data, Mocap
 from envs.physics.bits import float64_bits
-from envs.physics.engines import Engine, make_engine
+from envs.physics.foreign import STATE, Copy, Engine
 
 _STATE_NAMES = frozenset({"qpos", "qvel"})
-_DIVERGED = [
-    int(warning)
-    for warning in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    )
-]
 
 
 def usable_cpus() -> int:
@@ -66,12 +54,6 @@ class NativePhysics:
         num_threads: int | None = None,
     ):
         self._model = model
-        self._num_substeps = num_substeps
-        self._last_stage = int(mujoco.mjtStage.mjSTAGE_ACC if refresh else mujoco.mjtStage.mjSTAGE_NONE)
-        # Each of JAX's CPU devices runs its own simulations, side by side with the others.
-        self._num_threads = num_threads or max(1, usable_cpus() // jax.local_device_count())
-        self._lock = threading.Lock()
-        self._idle_engines: dict[int, list[Engine]] = {}  # by number of simulations; a call holds one for itself
         self._fields, self._track = tuple(fields), tuple(track)
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in _STATE_NAMES))
         template = mujoco.MjData(model)
@@ -89,6 +71,18 @@ class NativePhysics:
             ["qpos", "qvel", *self._fields, *(f"change/{n}" for n in self._track)],
             self._shapes | {f"change/{n}": self._shapes[n] for n in self._track},
         )
+        self._engine = Engine(
+            model,
+            # Each of JAX's CPU devices runs its own simulations, side by side with the others.
+            num_threads=num_threads or max(1, usable_cpus() // jax.local_device_count()),
+            num_substeps=num_substeps,
+            last_stage=int(mujoco.mjtStage.mjSTAGE_ACC if refresh else mujoco.mjtStage.mjSTAGE_NONE),
+            num_state=self._num_state,
+            row_size=self._row_size,
+            output_size=self._output_size,
+            derived=self._derived,
+            copies=self._copies(),
+        )
 
     def init(self, qpos: ArrayLike, qvel: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.init`. Without derived arrays the engine is not called."""
@@ -97,21 +91,23 @@ class NativePhysics:
         rest = jnp.zeros(self._row_size - 1 - self._model.nq - self._model.nv, dtype)
         bits = float64_bits(jnp.concatenate([jnp.zeros(1, dtype), qpos, qvel, rest]))
         if self._derived:
-            return self._call(self._forward, bits, jnp.zeros(self._model.nu, dtype), mocap)
+            return self._call(self._engine.forward, bits, jnp.zeros(self._model.nu, dtype), mocap)
         change = {n: jnp.zeros(self._shapes[n], dtype) for n in self._track}
         return Data(qpos=qpos, qvel=qvel, fields={}, change=change, backend=bits)
 
     def step(self, data: Data, ctrl: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.step`."""
-        return self._call(self._advance, data.backend, jnp.asarray(ctrl), mocap)
+        return self._call(self._engine.step, data.backend, jnp.asarray(ctrl), mocap)
 
-    def _call(self, function: Callable[..., None], bits: jax.Array, ctrl: jax.Array, mocap: Mocap | None) -> Data:
-        shapes = (
-            jax.ShapeDtypeStruct((2 * self._row_size,), jnp.uint32),
-            jax.ShapeDtypeStruct((self._output_size,), jnp.result_type(float)),
-        )
+    def _call(
+        self,
+        call: Callable[..., tuple[jax.Array, jax.Array]],
+        bits: jax.Array,
+        ctrl: jax.Array,
+        mocap: Mocap | None,
+    ) -> Data:
         poses = () if mocap is None else (mocap.quat.ravel(), mocap.pos.ravel())
-        bits, values = host_call(function, shapes, bits, ctrl, *poses)
+        bits, values = call(bits, ctrl, *poses)
 
         def output(name: str, like: str) -> jax.Array:
             flat: jax.Array = values[self._outputs[name]]
@@ -125,124 +121,26 @@ class NativePhysics:
             backend=bits,
         )
 
-    @contextlib.contextmanager
-    def _engine(self, num_sims: int) -> Iterator[Engine]:
-        """An engine of that size that no other device's program is using."""
-        with self._lock:
-            idle = self._idle_engines.setdefault(num_sims, [])
-            engine = idle.pop() if idle else None
-        if engine is None:
-            engine = make_engine(self._model, num_sims, min(self._num_threads, num_sims), self._derived)
-        try:
-            yield engine
-        finally:
-            with self._lock:
-                idle.append(engine)
-
-    # What follows runs on the host, inside a running JAX program: NumPy only, a JAX call could deadlock.
-
-    def _advance(self, bits: np.ndarray, ctrl: np.ndarray, *poses_and_outputs: np.ndarray) -> None:
-        *poses, bits_out, values_out = poses_and_outputs
-        if not poses or poses[1].shape[1] == 3 * self._model.nmocap:
-            calls = [_Call(poses, self._num_substeps, self._last_stage)]
-        else:
-            quat, path = poses
-            stages = [0] * (self._num_substeps - 1) + [self._last_stage]
-            places = np.split(path, self._num_substeps, axis=1)
-            calls = [_Call([quat, pos], 1, stage) for pos, stage in zip(places, stages, strict=True)]
-        self._run(calls, bits, ctrl, bits_out, values_out)
-
-    def _forward(self, bits: np.ndarray, ctrl: np.ndarray, *poses_and_outputs: np.ndarray) -> None:
-        *poses, bits_out, values_out = poses_and_outputs
-        self._run([_Call(poses, 0)], bits, ctrl, bits_out, values_out)
-
-    def _run(
-        self,
-        calls: Sequence["_Call"],
-        bits: np.ndarray,
-        ctrl: np.ndarray,
-        bits_out: np.ndarray,
-        values_out: np.ndarray,
-    ) -> None:
-        old, new = bits.view(np.float64), bits_out.view(np.float64)
-        end = self._num_state
-        failed = np.zeros(len(bits), bool)
-        with self._engine(len(bits)) as engine:
-            engine.state[:, :end] = old[:, :end]
-            engine.state[:, end : end + ctrl.shape[1]] = ctrl
-            for call in calls:
-                failed |= call(engine)
-            self._write(engine, old if calls[0].num_steps else None, new, values_out)
-        if failed.any():
-            new[failed], values_out[failed] = np.nan, np.nan
-
-    def _write(self, engine: Engine, old: np.ndarray | None, new: np.ndarray, values: np.ndarray) -> None:
-        """Copies the engine's state and outputs to the result rows. `old` None means that nothing has changed."""
-        num_sims = len(new)
-        new[:, : self._num_state] = engine.state[:, : self._num_state]
+    def _copies(self) -> list[Copy]:
+        """The engine's row is the state and the tracked arrays; then come the outputs."""
+        copies = []
         for name, columns in self._tracked_columns.items():
-            new[:, columns] = engine.bind(name).reshape(num_sims, -1)
-        for name, columns in self._state_columns.items():
-            values[:, self._outputs[name]] = new[:, columns]
-        for name in self._fields:
-            values[:, self._outputs[name]] = engine.bind(name).reshape(num_sims, -1)
-        for name in self._track:
-            columns = (self._state_columns | self._tracked_columns)[name]
-            values[:, self._outputs[f"change/{name}"]] = 0 if old is None else new[:, columns] - old[:, columns]
-
-
-def host_call(function: Callable[..., None], shapes: Any, *args: jax.Array) -> Any:
-    """Calls `function(*args, *outputs)` on 2-D NumPy arrays `[num_sims, size]`, all vmapped axes flattened to one.
-
-    On the CPU the outputs are written in place into JAX's own buffers; this reaches about 85 % of the raw engine's
-    rate at 16 simulations, where `jax.pure_callback`, used elsewhere, reaches 45 %.
-    """
-
-    def rows(array: Any) -> np.ndarray:
-        flat: np.ndarray = np.asarray(array)
-        return flat.reshape(-1, flat.shape[-1])
-
-    def in_place(_: Any, outputs: Any, *inputs: Any) -> None:
-        function(*map(rows, inputs), *map(rows, outputs))
-
-    def by_value(*inputs: Any) -> Any:
-        lead = np.shape(inputs[0])[:-1]
-        outputs = tuple(np.empty((*lead, *s.shape), s.dtype) for s in shapes)
-        function(*map(rows, inputs), *map(rows, outputs))
-        return outputs
-
-    if jax.default_backend() == "cpu":
-        from jax.experimental.buffer_callback import buffer_callback
-
-        return buffer_callback(in_place, shapes, vmap_method="broadcast_all")(*args)
-    return jax.pure_callback(by_value, shapes, *args, vmap_method="broadcast_all")
-
-
-@dataclasses.dataclass(frozen=True)
-class _Call:
-    """Some engine steps with the mocap bodies standing still, or none and the forward pass."""
-
-    poses: Sequence[np.ndarray]  # quat [num_sims, 4 num_mocap] and pos [num_sims, 3 num_mocap], or nothing
-    num_steps: int
-    stage: int = 0
-
-    def __call__(self, engine: Engine) -> np.ndarray | bool:
-        """Which simulations diverged or raised, `[num_sims]`; False if none did."""
-        for name, values in zip(("mocap_quat", "mocap_pos"), self.poses, strict=False):
-            target = engine.bind(name)
-            target[...] = values.reshape(target.shape)
-        failed: np.ndarray | bool = False
-        try:
-            if self.num_steps:
-                engine.step(nstep=self.num_steps, stage=self.stage)
-            else:
-                engine.forward()
-        except SimulationError:
-            failed = engine.status != 0
-        if engine.warning.any():  # rare, and cheaper to ask than to select the kinds each time
-            failed |= np.asarray(engine.warning[:, _DIVERGED, 1].any(axis=1))
-            engine.warning[...] = 0
-        return failed
+            source, size = self._derived.index(name), columns.stop - columns.start
+            copies.append(Copy(source=source, start=0, size=size, into_row=True, target=columns.start))
+        for name, columns in self._outputs.items():
+            array = name.removeprefix("change/")
+            within = (self._state_columns | self._tracked_columns).get(array)
+            copies.append(
+                Copy(
+                    source=STATE if array in _STATE_NAMES else self._derived.index(array),
+                    start=within.start if within and array in _STATE_NAMES else 0,
+                    size=columns.stop - columns.start,
+                    into_row=False,
+                    target=columns.start,
+                    change=within.start if within and name.startswith("change/") else -1,
+                )
+            )
+        return copies
 
 
 def _columns(names: Sequence[str], shapes: dict[str, Any], start: int = 0) -> tuple[dict[str, slice], int]:
