@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 from ccil_jax.config import ConfigError
 from ccil_jax.demonstrations import DemonstrationsError
 from ccil_jax.files import DISK_IS_FULL
+from experiments import devices
 
 MAX_ERROR = 1000  # characters of an error message, which may quote a file
 
@@ -63,6 +64,7 @@ def _hyphenated(token: str) -> str:
 def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None], argv: Sequence[str] | None) -> int:
     """Parses and runs; wrong input found later than parsing ends in the same one line and exit status 2."""
     arguments = parser.parse_args(argv)
+    devices.keep_programs()
     try:
         return run(arguments) or 0
     except (UsageError, ConfigError, DemonstrationsError) as error:

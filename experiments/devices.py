@@ -1,7 +1,12 @@
-"""Spreads seeds over the cores of a CPU, before JAX starts."""
+"""What JAX is told before it starts: how many CPU devices there are, and where compiled programs are kept."""
 
 import contextlib
+import hashlib
 import os
+import platform
+from pathlib import Path
+
+_CACHE_BYTES = 2 * 2**30  # of compiled programs; those not used for longest go first
 
 
 def num_cpu_devices(num_seeds: int, num_cores: int, *, several: bool = False) -> int:
@@ -27,3 +32,28 @@ def spread_seeds(num_seeds: int, *, several: bool = False) -> None:
 
     with contextlib.suppress(RuntimeError):  # JAX has started already (a notebook, a test): it keeps its devices
         jax.config.update("jax_num_cpu_devices", num_devices)
+
+
+def keep_programs() -> None:
+    """Has JAX keep compiled programs in the user's cache folder, so that the second start of one compiles nothing.
+
+    JAX's own variables have precedence: JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE=false.
+    """
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(caches) / "ccil_jax" / "programs" / _processor()
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # slower, not wrong
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(_CACHE_BYTES))
+
+
+def _processor() -> str:
+    """A name for what machine code runs here: home folders are shared between machines."""
+    facts = Path("/proc/cpuinfo")
+    lines = facts.read_text(encoding="utf-8").splitlines() if facts.is_file() else [platform.processor()]
+    features = next((line for line in lines if line.startswith(("flags", "Features"))), lines[0])
+    return f"{platform.machine()}-{hashlib.sha256(features.encode()).hexdigest()[:12]}"
