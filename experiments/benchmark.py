@@ -16,7 +16,7 @@ from typing import Any
 from ccil_jax.config import METHOD_NAMES, PRESETS
 from ccil_jax.versions import versions
 from envs.registry import PHYSICS
-from experiments import command_line, devices, options, run_folder
+from experiments import command_line, devices, options, peers, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.summary import show
 
@@ -43,6 +43,12 @@ def make_parser() -> Parser:
     parser.add_argument("--seed", default=0, type=command_line.natural, metavar="N", help="base seed (default: 0)")
     parser.add_argument(
         "--out", type=Path, default=Path("benchmark.json"), metavar="FILE", help="result file (default: benchmark.json)"
+    )
+    parser.add_argument(
+        "--peers",
+        type=Path,
+        metavar="DIR",
+        help="instead: compare with other packages, whose environments are in DIR (docs/performance.md)",
     )
     parser.add_argument("--row", help=argparse.SUPPRESS)  # a setting as JSON: measure it here and print the result
     return parser
@@ -71,11 +77,13 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
-def measure_row(setting: dict[str, Any]) -> dict[str, Any]:
+def measure_row(setting: dict[str, Any], launcher: str = "benchmark") -> dict[str, Any]:
     """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
-    command = [sys.executable, "-m", "experiments.benchmark", "--row", json.dumps(setting)]
+    command = [sys.executable, "-m", f"experiments.{launcher}", "--row", json.dumps(setting)]
     path = os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path})
+    # The compilation is measured, so nothing may come from a cache.
+    environment = {**os.environ, "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
         raise UsageError(
@@ -108,6 +116,29 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     show(table)
 
 
+def _beside(setting: dict[str, Any], peer: peers.Peer, num_seeds: int) -> dict[str, Any]:
+    """The row of ours that does a peer's work: its task and method, and batches of 2000 steps as there."""
+    changes = {"batch_size": 2000, "cost_limit": 0.0}
+    return {**setting, "task": peer.task, "method": peer.method, "num_seeds": num_seeds, "changes": changes}
+
+
+def print_peers(compared: Sequence[dict[str, Any]]) -> None:
+    """Peers and ours as a terminal table."""
+    from rich.table import Table
+
+    table = Table(title="training, environment steps per second", title_justify="left")
+    for title in ("trainer", "steps/s", "ours : it"):
+        table.add_column(title, justify="left" if title == "trainer" else "right")
+    for comparison in compared:
+        for way, rates in comparison["ways"].items():
+            table.add_row(f"{comparison['peer']}, {way}", " ".join(f"{rate:,.0f}" for rate in rates), "")
+        for seeds, rate in comparison["our_steps_per_second"].items():
+            ours = f"ours: {comparison['our_method']} on {comparison['task']}, {seeds} seed(s)"
+            table.add_row(ours, f"{rate:,.0f}", f"{comparison['ratio'][seeds]:.1f}")
+        table.add_section()
+    show(table)
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Measures all rows, prints and writes them."""
     if arguments.row is not None:
@@ -118,6 +149,7 @@ def run(arguments: argparse.Namespace) -> None:
         print(json.dumps(measuring.measure(measuring.Setting(**setting))))
         return
     settings = settings_of(arguments)
+    pythons = peers.find_pythons(arguments.peers) if arguments.peers else None
     command_line.check_writable(arguments.out.parent, "--out")
     facts = {
         "command": command_line.command(),
@@ -127,6 +159,12 @@ def run(arguments: argparse.Namespace) -> None:
         "load_average": os.getloadavg(),
     }
     rows: list[dict[str, Any]] = []
+    if pythons:
+        compared = peers.compare(pythons, lambda peer, seeds: measure_row(_beside(settings[0], peer, seeds)))
+        rows = [row for comparison in compared for row in comparison.pop("our_rows")]
+        run_folder.write_json(arguments.out, {**facts, "rows": rows, "peers": compared})
+        print_peers(compared)
+        settings = []
     for setting in settings:
         print(f"measuring {setting['task']}, {setting['num_seeds']} seed(s) ...", file=sys.stderr, flush=True)
         rows.append(measure_row(setting))

@@ -37,6 +37,34 @@ class Setting:
     seconds: float  # least duration of one measurement
     seed: int
     changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to the preset: fields of `Config`
+    num_demonstration_steps: int = 10_000
+
+
+def measure_training(setting: Setting) -> dict[str, Any]:
+    """Whole training alone: seconds per iteration (the median), seconds to compile, and peak memory."""
+    env: Any = envs.make(setting.task, physics=setting.physics)
+    config = make_config(setting)
+    training, compile_seconds = _training(config, env, setting)
+    training()
+    rates = [_rate(training, setting.seconds) for _ in range(setting.rounds)]
+    rate = float(np.median(rates))
+    return {
+        "task": setting.task,
+        "physics": env.physics_name,
+        "training_steps_per_second": rate,
+        "seconds_per_iteration": setting.num_seeds * config.steps_per_iteration / rate,
+        "compile_seconds": compile_seconds,
+        "peak_memory_mib": _peak_memory(),
+        "all_rates": rates,
+    }
+
+
+def make_config(setting: Setting) -> Config:
+    """Of the training that is measured: two iterations, which make a chunk."""
+    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in setting.changes.items()}
+    chosen = {"method": setting.method, "num_envs": setting.num_envs}
+    config = Config(**{**PRESETS[setting.preset], **changes, **chosen})
+    return config.replace(env_steps=2 * config.steps_per_iteration)
 
 
 def measure(setting: Setting) -> dict[str, Any]:
@@ -47,9 +75,7 @@ def measure(setting: Setting) -> dict[str, Any]:
     controls: the ceiling of the native backend.
     """
     env: Any = envs.make(setting.task, physics=setting.physics)
-    chosen = {"method": setting.method, "num_envs": setting.num_envs}
-    config = Config(**{**PRESETS[setting.preset], **setting.changes, **chosen})
-    config = config.replace(env_steps=2 * config.steps_per_iteration)  # a chunk is two iterations
+    config = make_config(setting)
     training, compile_seconds = _training(config, env, setting)
     plain, meta = _policy_steps(config, env, setting)
     works = {
@@ -159,7 +185,7 @@ def _rollout(config: Config, env: Any, setting: Setting) -> Work:
 def _training(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
     """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
     random = np.random.default_rng(setting.seed)
-    num_steps = 10_000
+    num_steps = setting.num_demonstration_steps
     expert = Demonstrations(
         obs=random.standard_normal((num_steps, env.obs_dim)).astype(np.float32),
         actions=random.uniform(env.action_low, env.action_high, (num_steps, env.action_dim)).astype(np.float32),
