@@ -18,6 +18,7 @@ SOURCES = {  # module name -> file
     for package in PACKAGES
     for path in sorted((ROOT / package).rglob("*.py"))
 }
+FOREIGN = {name for name in SOURCES if name.startswith("experiments.peers.")}  # they run in environments of their own
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOURCES.items()}
 
 # A file of the learner imports only from those before it. A new file needs a place here.
@@ -206,7 +207,7 @@ def test_importing_imports_no_heavy_package(name: str) -> None:
 def test_everything_can_be_imported_where_jax_has_no_device() -> None:
     python(
         "import importlib, ccil_jax, envs\n"
-        f"for name in {list(SOURCES)}: importlib.import_module(name)\n"
+        f"for name in {sorted(SOURCES.keys() - FOREIGN)}: importlib.import_module(name)\n"
         "for package in (ccil_jax, envs):\n"
         "    for name in package.__all__: getattr(package, name)",
         JAX_PLATFORMS="no_such_platform",

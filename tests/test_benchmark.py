@@ -76,7 +76,7 @@ def test_growth_measures_one_axis_at_a_time(tmp_path: Path, monkeypatch: pytest.
         }
 
     monkeypatch.setattr(benchmark, "measure_row", measure_row)
-    arguments = ["--axes", "seeds", "width", "--largest", "128", "--env", "swimmer"]
+    arguments = ["--axes", "seeds", "width", "--largest", "128", "--env", "Swimmer"]
     assert growth.main([*arguments, "--out", str(tmp_path / "g")]) == 0
     assert [s["num_seeds"] for s in measured] == [1, 2, 4, 8, 16, 32, 64, 1, 1, 1]
     assert [s["changes"].get("hidden_sizes") for s in measured[7:]] == [[32, 32], [64, 64], [128, 128]]
