@@ -50,6 +50,7 @@ def make_parser() -> Parser:
         metavar="DIR",
         help="instead: compare with other packages, whose environments are in DIR (docs/performance.md)",
     )
+    parser.add_argument("--profile", action="store_true", help="instead: where the time of an iteration goes")
     parser.add_argument("--row", help=argparse.SUPPRESS)  # a setting as JSON: measure it here and print the result
     return parser
 
@@ -77,9 +78,9 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
-def measure_row(setting: dict[str, Any], launcher: str = "benchmark") -> dict[str, Any]:
+def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
     """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
-    command = [sys.executable, "-m", f"experiments.{launcher}", "--row", json.dumps(setting)]
+    command = [sys.executable, "-m", f"experiments.{launcher}", *options, "--row", json.dumps(setting)]
     path = os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     # The compilation is measured, so nothing may come from a cache.
     environment = {**os.environ, "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
@@ -116,6 +117,22 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     show(table)
 
 
+def print_profiles(rows: Sequence[dict[str, Any]]) -> None:
+    """The parts of an iteration as a terminal table."""
+    from rich.table import Table
+
+    table = Table(
+        title="microseconds per environment step, all seeds together (ratio to physics)", title_justify="left"
+    )
+    table.add_column("part")
+    for row in rows:
+        table.add_column(f"{row['task']}, {row['num_seeds']} x {row['num_envs']}", justify="right")
+    for part in rows[0]["parts"]:
+        of_rows = [row["parts"][part] for row in rows]
+        table.add_row(part, *(f"{x['microseconds_per_step']:.2f} ({x['to_physics']:.2f})" for x in of_rows))
+    show(table)
+
+
 def _beside(setting: dict[str, Any], peer: peers.Peer, num_seeds: int) -> dict[str, Any]:
     """The row of ours that does a peer's work: its task and method, and batches of 2000 steps as there."""
     changes = {"batch_size": 2000, "cost_limit": 0.0}
@@ -146,7 +163,12 @@ def run(arguments: argparse.Namespace) -> None:
         devices.spread_seeds(setting["num_seeds"])  # as training does
         from experiments import measuring  # imports JAX
 
-        print(json.dumps(measuring.measure(measuring.Setting(**setting))))
+        if arguments.profile:
+            from experiments import profiling
+
+            print(json.dumps(profiling.profile(measuring.Setting(**setting))))
+        else:
+            print(json.dumps(measuring.measure(measuring.Setting(**setting))))
         return
     settings = settings_of(arguments)
     pythons = peers.find_pythons(arguments.peers) if arguments.peers else None
@@ -167,9 +189,12 @@ def run(arguments: argparse.Namespace) -> None:
         settings = []
     for setting in settings:
         print(f"measuring {setting['task']}, {setting['num_seeds']} seed(s) ...", file=sys.stderr, flush=True)
-        rows.append(measure_row(setting))
+        rows.append(measure_row(setting, "benchmark", *(["--profile"] if arguments.profile else [])))
         run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
-    print_rows(rows)
+    if arguments.profile:
+        print_profiles(rows)
+    else:
+        print_rows(rows)
     print(f"written to {arguments.out}")
 
 

@@ -44,9 +44,9 @@ def measure_training(setting: Setting) -> dict[str, Any]:
     """Whole training alone: seconds per iteration (the median), seconds to compile, and peak memory."""
     env: Any = envs.make(setting.task, physics=setting.physics)
     config = make_config(setting)
-    training, compile_seconds = _training(config, env, setting)
+    training, compile_seconds = training_work(config, env, setting)
     training()
-    rates = [_rate(training, setting.seconds) for _ in range(setting.rounds)]
+    rates = [rate_of(training, setting.seconds) for _ in range(setting.rounds)]
     rate = float(np.median(rates))
     return {
         "task": setting.task,
@@ -76,11 +76,11 @@ def measure(setting: Setting) -> dict[str, Any]:
     """
     env: Any = envs.make(setting.task, physics=setting.physics)
     config = make_config(setting)
-    training, compile_seconds = _training(config, env, setting)
+    training, compile_seconds = training_work(config, env, setting)
     plain, meta = _policy_steps(config, env, setting)
     works = {
-        "physics": _physics(env, setting),
-        "rollout": _rollout(config, env, setting),
+        "physics": physics_work(env, setting),
+        "rollout": rollout_work(config, env, setting),
         "training": training,
         "plain": plain,
         "meta": meta,
@@ -90,7 +90,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         work()  # compiles, and warms caches
     for _ in range(setting.rounds):
         for name, work in works.items():
-            rates[name].append(_rate(work, setting.seconds))
+            rates[name].append(rate_of(work, setting.seconds))
     median = {name: float(np.median(values)) for name, values in rates.items()}
     return {
         "task": setting.task,
@@ -114,7 +114,7 @@ def measure(setting: Setting) -> dict[str, Any]:
     }
 
 
-def _rate(work: Work, seconds: float) -> float:
+def rate_of(work: Work, seconds: float) -> float:
     """Units per second of `work`, repeated for at least `seconds`."""
     units, start = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - start) < seconds or units == 0:
@@ -128,7 +128,7 @@ def _peak_memory() -> float:
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 
 
-def _physics(env: Any, setting: Setting) -> Work:
+def physics_work(env: Any, setting: Setting) -> Work:
     """The engine alone, from states after a reset: no JAX, no observations, rewards or further resets."""
     from envs.physics.native import usable_cpus
 
@@ -152,7 +152,7 @@ def _physics(env: Any, setting: Setting) -> Work:
     return work
 
 
-def _rollout(config: Config, env: Any, setting: Setting) -> Work:
+def rollout_work(config: Config, env: Any, setting: Setting) -> Work:
     """Policy and environment inside one compiled program, without learning."""
     policy = networks.make_policy(config, env.obs_dim, env.action_dim)
 
@@ -166,27 +166,29 @@ def _rollout(config: Config, env: Any, setting: Setting) -> Work:
         state, transition = rollout.rollout(env, policy.apply, actor, state, config.num_steps, key)
         return state, jnp.mean(transition.reward)
 
-    def spread(function: Callable[..., Any]) -> Callable[..., Any]:  # over devices, as training does
-        mesh, spec = program.run_mesh(setting.num_seeds), jax.P("runs")
-        return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
-
     keys = jax.random.split(jax.random.key(setting.seed), setting.num_seeds)
-    actor, state = spread(init)(keys)
-    compiled = spread(run)
+    actor, state = spread(init, setting.num_seeds)(keys)
+    compiled = spread(run, setting.num_seeds)
 
     def work() -> int:
         nonlocal state
-        state, _ = _wait(compiled(actor, state, keys))
+        state, _ = wait(compiled(actor, state, keys))
         return setting.num_seeds * config.batch_size
 
     return work
 
 
-def _training(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
-    """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
+def spread(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
+    """A function of one seed as one of all, [S]-leading, on as many devices as training uses."""
+    mesh, spec = program.run_mesh(num_seeds), jax.P("runs")
+    return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+
+
+def noise(env: Any, setting: Setting) -> Demonstrations:
+    """Demonstrations of the right shapes, whose content does not matter for the time it takes to learn from them."""
     random = np.random.default_rng(setting.seed)
     num_steps = setting.num_demonstration_steps
-    expert = Demonstrations(
+    return Demonstrations(
         obs=random.standard_normal((num_steps, env.obs_dim)).astype(np.float32),
         actions=random.uniform(env.action_low, env.action_high, (num_steps, env.action_dim)).astype(np.float32),
         rewards=None,
@@ -195,13 +197,18 @@ def _training(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
         truncated=np.arange(num_steps) % 1000 == 999,
         episode_ends=np.arange(1000, num_steps + 1, 1000),
     )
+
+
+def training_work(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
+    """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
+    expert = noise(env, setting)
     resolved = runner.resolve(config, env, expert)
     compiled = program.compile_program(resolved, env, runner.expert_data(expert), setting.num_seeds)
     state = compiled.init(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
 
     def work() -> int:
         nonlocal state
-        state, _ = _wait(compiled.chunk(state))
+        state, _ = wait(compiled.chunk(state))
         return setting.num_seeds * compiled.chunk_length * config.steps_per_iteration
 
     return work, compiled.compile_seconds
@@ -245,14 +252,14 @@ def _policy_steps(config: Config, env: Any, setting: Setting) -> tuple[Work, Wor
     return _once(lambda: plain(*inputs)), _once(lambda: meta(taken))
 
 
-def _wait(values: Any) -> Any:
+def wait(values: Any) -> Any:
     """Returns `values` once they are computed."""
     return jax.tree.map(lambda leaf: leaf.block_until_ready(), values)
 
 
 def _once(call: Callable[[], Any]) -> Work:
     def work() -> int:
-        _wait(call())
+        wait(call())
         return 1
 
     return work
