@@ -252,6 +252,30 @@ def numpy_log_prob(params: PyTree, batch: Batch) -> np.ndarray:
     return np.sum(scipy.stats.norm.logpdf(np.asarray(batch.action, np.float64), mean, np.exp(log_std)), axis=-1)
 
 
+def gae_by_loop(
+    signal: np.ndarray,
+    value: np.ndarray,
+    next_value: np.ndarray,
+    terminated: np.ndarray,
+    done: np.ndarray,
+    gamma: float,
+    gae_lambda: float,
+) -> np.ndarray:
+    """The definition: for every step, the decayed sum of residuals up to the end of its episode or of the batch."""
+    num_steps, num_envs = signal.shape
+    advantage = np.zeros((num_steps, num_envs))
+    for n in range(num_envs):
+        for t in range(num_steps):
+            weight = 1.0
+            for k in range(t, num_steps):
+                future = 0.0 if terminated[k, n] else gamma * next_value[k, n]
+                advantage[t, n] += weight * (signal[k, n] + future - value[k, n])
+                if done[k, n]:
+                    break
+                weight *= gamma * gae_lambda
+    return advantage
+
+
 def same_bits(a: PyTree, b: PyTree) -> bool:
     """Whether two pytrees have the same structure and the same bits in every leaf."""
 

@@ -8,13 +8,32 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from ccil_jax import constraints, policy_step, trust_region
+from ccil_jax import (
+    constraints,
+    networks,
+    on_policy,
+    policy_step,
+    reward_models,
+    runner,
+    running_statistics,
+    trust_region,
+)
 from ccil_jax.config import Config
 from ccil_jax.constraints import Multiplier, Outer
 from ccil_jax.policy_step import PolicyStep
+from ccil_jax.reward_models import RewardModel
 from ccil_jax.trust_region import Directions
 from ccil_jax.types import Batch, PyTree
-from tests.probe_envs import PolicyProblem, numpy_log_prob, policy_problem, same_bits
+from tests.probe_envs import (
+    PolicyProblem,
+    Walk,
+    gae_by_loop,
+    numpy_log_prob,
+    policy_problem,
+    same_bits,
+    walk_config,
+    walk_demonstrations,
+)
 
 KINDS = ("full", "direct", "indirect")
 STEP = 1e-5  # of the central differences: their error is about STEP^2 + 1e-16 / STEP
@@ -361,3 +380,58 @@ def test_a_split_by_trajectory_holds_out_whole_simulations() -> None:
         assert not set(simulations) & set(np.asarray(training.cost).astype(int) % 5)
         chosen.add(frozenset(simulations.tolist()))
     assert len(chosen) > 4
+
+
+def test_re_evaluated_advantages_against_a_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One iteration step by step: what the outer loss sees is the last batch as the updated networks judge it.
+
+    The reward is twice, then three times the second observation; critics and statistics are those after the iteration.
+    """
+    seen: dict[str, Any] = {}
+
+    def update(state: Any, transition: Any, key: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
+        seen["transition"] = transition
+        return state + 1.0, {}
+
+    model = RewardModel(
+        init=lambda key: jnp.asarray(2.0),
+        reward=lambda state, transition: state * transition.obs[..., 1],
+        update=update,
+    )
+    outer_problem = policy_step.outer_problem
+
+    def watched(config: Config, apply: Any, constraint: Any, taken: policy_step.PolicyStep) -> Any:
+        seen["held_out"] = taken.held_out
+        return outer_problem(config, apply, constraint, taken)
+
+    monkeypatch.setattr(reward_models, "discriminator", lambda *arguments: model)
+    monkeypatch.setattr(policy_step, "outer_problem", watched)
+    demonstrations = walk_demonstrations()
+    config = walk_config(method="malm", outer_advantage="re-evaluated", held_out_fraction=0.5)
+    config = runner.resolve(config, Walk(), demonstrations)
+    agent = on_policy.make(config, Walk(), runner.expert_data(demonstrations))
+    state, _ = agent.step(agent.init(jax.random.key(5)))  # not jitted, so that what is seen are numbers
+
+    transition, held_out = jax.tree.map(np.asarray, (seen["transition"], seen["held_out"]))
+    critic = networks.make_scalar(config, Walk().obs_dim)
+    reward_critic = jax.tree.map(lambda leaf: leaf[on_policy.REWARD], state.critics.params)
+    obs, next_obs = (
+        running_statistics.normalize(state.actor.obs_statistics, jnp.asarray(x))
+        for x in (transition.obs, transition.next_obs)
+    )
+    advantage = gae_by_loop(
+        3.0 * transition.obs[..., 1],
+        np.asarray(critic.apply(reward_critic, obs)),
+        np.asarray(critic.apply(reward_critic, next_obs)),
+        transition.terminated,
+        transition.done,
+        config.gamma,
+        config.gae_lambda,
+    )
+    advantage = ((advantage - advantage.mean()) / advantage.std()).ravel()
+    actions = transition.action.reshape(len(advantage), -1)
+    assert held_out.action.shape == (config.num_held_out, Walk().action_dim)
+    rows = [int(np.flatnonzero((actions == action).all(axis=1)).item()) for action in held_out.action]
+    assert len(set(rows)) == config.num_held_out
+    np.testing.assert_allclose(held_out.reward_advantage, advantage[rows], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(held_out.obs, np.asarray(obs).reshape(len(advantage), -1)[rows], rtol=1e-5)

@@ -6,30 +6,7 @@ import numpy as np
 import pytest
 
 from ccil_jax.returns import gae
-
-
-def loop(
-    signal: np.ndarray,
-    value: np.ndarray,
-    next_value: np.ndarray,
-    terminated: np.ndarray,
-    done: np.ndarray,
-    gamma: float,
-    gae_lambda: float,
-) -> np.ndarray:
-    """The definition: for every step, the decayed sum of residuals up to the end of its episode or of the batch."""
-    num_steps, num_envs = signal.shape
-    advantage = np.zeros((num_steps, num_envs))
-    for n in range(num_envs):
-        for t in range(num_steps):
-            weight = 1.0
-            for k in range(t, num_steps):
-                future = 0.0 if terminated[k, n] else gamma * next_value[k, n]
-                advantage[t, n] += weight * (signal[k, n] + future - value[k, n])
-                if done[k, n]:
-                    break
-                weight *= gamma * gae_lambda
-    return advantage
+from tests.probe_envs import gae_by_loop
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -43,7 +20,7 @@ def test_against_a_loop_with_terminations_and_truncations_mixed(seed: int) -> No
     with jax.enable_x64(True):
         arrays = [jnp.asarray(x) for x in (signal, value, next_value, terminated, done)]
         advantage, returns = jax.jit(gae)(*arrays, 0.9, 0.8)
-    expected = loop(signal, value, next_value, terminated, done, 0.9, 0.8)
+    expected = gae_by_loop(signal, value, next_value, terminated, done, 0.9, 0.8)
     np.testing.assert_allclose(advantage, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(returns, expected + value, rtol=1e-12, atol=1e-12)
 
