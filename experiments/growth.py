@@ -98,7 +98,7 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]], title: str) -> None:
     exponents = exponents_of(rows)
     figure = Figure(figsize=(3.6 * len(axes), 3.6), layout="constrained")
     figure.suptitle(title, fontsize=10, x=0.01, ha="left")
-    panels = figure.subplots(1, len(axes), squeeze=False)[0]
+    panels = figure.subplots(1, len(axes), squeeze=False, sharey=True)[0]
     for panel, axis in zip(panels, axes, strict=True):
         own = [row for row in rows if row["axis"] == axis]
         sizes = [row["value"] for row in own]
@@ -107,10 +107,13 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]], title: str) -> None:
             slope = exponents[axis][name]
             text = label if slope is None else f"{label}: {slope:.2f}"
             panel.loglog(sizes, values / values[0], marker="o", markersize=4, label=text)
+        panel.set_xticks(sizes, [f"{size:,}" for size in sizes], fontsize=7)
+        panel.minorticks_off()
         panel.set_xlabel(axis)
         panel.set_title(f"{axis}, exponents", fontsize=9, loc="left")
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=7, frameon=False)
+        panel.legend(fontsize=7, frameon=False, loc="upper left")
+        panel.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("relative to the smallest")
     figure.savefig(path, dpi=150)
 
