@@ -94,6 +94,17 @@ def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: 
     return row
 
 
+def facts_of_machine() -> dict[str, Any]:
+    """What goes with every measurement."""
+    return {
+        "command": command_line.command(),
+        "versions": versions(),
+        "git_commit": run_folder.git_commit(),
+        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load_average": os.getloadavg(),
+    }
+
+
 def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     """The rows as a terminal table."""
     from rich.table import Table
@@ -173,13 +184,7 @@ def run(arguments: argparse.Namespace) -> None:
     settings = settings_of(arguments)
     pythons = peers.find_pythons(arguments.peers) if arguments.peers else None
     command_line.check_writable(arguments.out.parent, "--out")
-    facts = {
-        "command": command_line.command(),
-        "versions": versions(),
-        "git_commit": run_folder.git_commit(),
-        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load_average": os.getloadavg(),
-    }
+    facts = facts_of_machine()
     rows: list[dict[str, Any]] = []
     if pythons:
         compared = peers.compare(pythons, lambda peer, seeds: measure_row(_beside(settings[0], peer, seeds)))

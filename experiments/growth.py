@@ -6,7 +6,6 @@ points, where what is constant matters least.
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.config import METHOD_NAMES
-from ccil_jax.versions import versions
 from experiments import benchmark, command_line, devices, options, run_folder
 from experiments.command_line import Parser
 from experiments.summary import show
@@ -149,21 +147,12 @@ def run(arguments: argparse.Namespace) -> None:
         return
     points = settings_of(arguments)
     command_line.check_output_folder(arguments.out, record="growth.json")
-    rows: list[dict[str, Any]] = []
+    facts, rows = benchmark.facts_of_machine(), list[dict[str, Any]]()
     for axis, value, setting in points:
         print(f"measuring {axis} {value:,} ...", file=sys.stderr, flush=True)
         rows.append({"axis": axis, "value": value, **benchmark.measure_row(setting, "growth")})
-        run_folder.write_json(
-            arguments.out / "growth.json",
-            {
-                "command": command_line.command(),
-                "versions": versions(),
-                "git_commit": run_folder.git_commit(),
-                "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-                "rows": rows,
-                "exponents": exponents_of(rows),
-            },
-        )
+        content = {**facts, "rows": rows, "exponents": exponents_of(rows)}
+        run_folder.write_json(arguments.out / "growth.json", content)
     title = f"{arguments.method} on {rows[0]['task']}: cost of an iteration, relative to the smallest"
     draw(arguments.out / "growth.png", rows, title)
     print_rows(rows)
