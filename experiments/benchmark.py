@@ -123,7 +123,7 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
             f"{row['training_to_physics']:.2f}",
             f"{row['meta_gradient_to_policy_step']:.2f}",
             f"{row['compile_seconds']:.1f}",
-            f"{row['peak_memory_mib']:,.0f}",
+            f"{row['peak_memory']:,.0f}",
         )
     show(table)
 

@@ -28,7 +28,7 @@ AXES: Mapping[str, tuple[int, ...]] = {
 MEASURES = {
     "seconds_per_iteration": "seconds per iteration",
     "compile_seconds": "seconds to compile",
-    "peak_memory_mib": "peak memory, MiB",
+    "peak_memory": "peak memory, MiB",
 }
 
 
@@ -129,7 +129,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
             if row["axis"] == axis:
                 numbers = (f"{row['seconds_per_iteration']:.3f}", f"{row['compile_seconds']:.1f}")
                 rate = f"{row['training_steps_per_second']:,.0f}"
-                table.add_row(axis, f"{row['value']:,}", *numbers, f"{row['peak_memory_mib']:,.0f}", rate)
+                table.add_row(axis, f"{row['value']:,}", *numbers, f"{row['peak_memory']:,.0f}", rate)
         slopes = ("-" if slope is None else f"{slope:.2f}" for slope in exponents.values())
         table.add_row("", "exponent", *slopes, "")
         table.add_section()

@@ -54,7 +54,7 @@ def measure_training(setting: Setting) -> dict[str, Any]:
         "training_steps_per_second": rate,
         "seconds_per_iteration": setting.num_seeds * config.steps_per_iteration / rate,
         "compile_seconds": compile_seconds,
-        "peak_memory_mib": _peak_memory(),
+        "peak_memory": _peak_memory(),
         "all_rates": rates,
     }
 
@@ -109,7 +109,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         "policy_step_seconds": 1 / median["plain"],
         "meta_gradient_seconds": 1 / median["meta"],
         "compile_seconds": compile_seconds,
-        "peak_memory_mib": _peak_memory(),
+        "peak_memory": _peak_memory(),
         "all_rates": rates,
     }
 
@@ -123,7 +123,7 @@ def rate_of(work: Work, seconds: float) -> float:
 
 
 def _peak_memory() -> float:
-    """Largest resident size of this process so far, MiB."""
+    """Largest resident size of this process so far, MiB: `peak_memory` of a row."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 

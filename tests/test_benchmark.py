@@ -71,7 +71,7 @@ def test_growth_measures_one_axis_at_a_time(tmp_path: Path, monkeypatch: pytest.
             "task": setting["task"],
             "seconds_per_iteration": 2.0 * size**2,
             "compile_seconds": 3.0,
-            "peak_memory_mib": 10.0 * size,
+            "peak_memory": 10.0 * size,
             "training_steps_per_second": 1.0,
         }
 
@@ -82,6 +82,6 @@ def test_growth_measures_one_axis_at_a_time(tmp_path: Path, monkeypatch: pytest.
     assert [s["changes"].get("hidden_sizes") for s in measured[7:]] == [[32, 32], [64, 64], [128, 128]]
     content = json.loads((tmp_path / "g" / "growth.json").read_text())
     assert content["exponents"]["seeds"]["seconds_per_iteration"] == pytest.approx(2.0)
-    assert content["exponents"]["width"]["peak_memory_mib"] == pytest.approx(1.0)
+    assert content["exponents"]["width"]["peak_memory"] == pytest.approx(1.0)
     assert content["exponents"]["width"]["compile_seconds"] == pytest.approx(0.0, abs=1e-9)
     assert (tmp_path / "g" / "growth.png").stat().st_size > 10_000
