@@ -1,7 +1,8 @@
 """Trains variants of MALM and CVAG that differ in one choice, and says what each choice is worth.
 
 Choices that are numbers inside the program share one compilation; the baselines and every other choice have a program
-of their own, as many runs each, so that their speeds compare. A question's first variant is its baseline.
+of their own, as many runs each, so that their speeds compare. A question's first variant is its baseline: what the
+preset `paper` has, from which all start unless another is given.
 """
 
 import argparse
@@ -114,8 +115,8 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
     answers = {}
     for name in names:
         question = QUESTIONS[name]
-        fields = {**shared, "method": question.method}
-        plain = options.config_from({**options.DEFAULTS, **fields}, fields.get("preset", options.DEFAULTS["preset"]))
+        fields = {"preset": "paper", **shared, "method": question.method}
+        plain = options.config_from({**options.DEFAULTS, **fields}, fields["preset"])
         for i, (answer, changes) in enumerate(question.answers.items()):
             folder = _name(plain, changes)
             baseline = i == 0

@@ -22,7 +22,7 @@ def test_every_answer_is_a_configuration(name: str) -> None:
     assert len(set(configs)) == len(configs) >= 2
 
 
-def test_the_first_answer_is_the_default(tmp_path: Path) -> None:
+def test_the_first_answer_is_the_papers(tmp_path: Path) -> None:
     answers = ablations.ask(list(QUESTIONS), SHARED, tmp_path)
     baselines = {answers[name, next(iter(question.answers))].name for name, question in QUESTIONS.items()}
     assert baselines <= set(METHOD_NAMES)  # no change in their names
