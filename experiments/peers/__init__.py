@@ -73,14 +73,21 @@ def find_pythons(folder: Path) -> dict[str, Path]:
 
 
 def compare(pythons: Mapping[str, Path], measure: Callable[[Peer, int], dict[str, Any]]) -> list[dict[str, Any]]:
-    """Times each peer in every way, before and after ours with 1 and 8 seeds (`measure`); medians."""
+    """Times each peer in every way, before and after ours with 1 and 8 seeds (`measure`); medians.
+
+    Raises `UsageError` where a peer fails in every way.
+    """
     rows = []
     for name, peer in PEERS.items():
         first = {way: _time(peer, pythons[name], arguments) for way, arguments in peer.ways.items()}
+        if all("error" in run for run in first.values()):
+            error = next(iter(first.values()))["error"]
+            raise UsageError(f"--peers: {peer.script} in {pythons[name]} failed: {error}")
         ours = {seeds: measure(peer, seeds) for seeds in (1, 8)}
         second = {way: _time(peer, pythons[name], arguments) for way, arguments in peer.ways.items()}
         ways = {way: [run[way]["steps_per_second"] for run in (first, second)] for way in peer.ways}
-        best = max(float(np.median(rates)) for rates in ways.values())
+        errors = {way: run[way]["error"] for run in (first, second) for way in peer.ways if "error" in run[way]}
+        best = max(float(np.median([rate for rate in rates if rate] or [0.0])) for rates in ways.values())
         rates = {seeds: row["training_steps_per_second"] for seeds, row in ours.items()}
         versions: dict[str, str] = next((run["versions"] for run in first.values() if run["versions"]), {})
         rows.append(
@@ -89,6 +96,7 @@ def compare(pythons: Mapping[str, Path], measure: Callable[[Peer, int], dict[str
                 "task": peer.task,
                 "our_method": peer.method,
                 "ways": ways,
+                "errors": errors,
                 "best_steps_per_second": best,
                 "our_steps_per_second": rates,
                 "ratio": {seeds: rate / best for seeds, rate in rates.items()},
@@ -100,14 +108,14 @@ def compare(pythons: Mapping[str, Path], measure: Callable[[Peer, int], dict[str
 
 
 def _time(peer: Peer, python: Path, arguments: tuple[str, ...]) -> dict[str, Any]:
-    """What the script prints; a rate of 0 where it takes too long. Raises `UsageError` where it fails."""
+    """What the script prints; a rate of 0 and an `error` where it fails or takes too long."""
     command = [str(python.absolute()), str(_FOLDER / peer.script), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_TIME_LIMIT)
     except subprocess.TimeoutExpired:
-        return {"steps_per_second": 0.0, "versions": {}}
+        return {"steps_per_second": 0.0, "versions": {}, "error": f"not done after {_TIME_LIMIT:.0f} s"}
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        raise UsageError(f"--peers: {peer.script} in {python} failed: {last}")
+        return {"steps_per_second": 0.0, "versions": {}, "error": last}
     printed: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
     return printed
