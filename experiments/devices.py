@@ -28,6 +28,9 @@ def spread_seeds(num_seeds: int, *, several: bool = False) -> None:
     # Enough threads that each device's program can wait for a LAPACK kernel (see `program.run_mesh`); XLA reads the
     # size of its pool from this variable.
     os.environ.setdefault("PJRT_NPROC", str(num_cores + num_devices))
+    if hasattr(os, "SCHED_BATCH"):  # Linux: a thread that wakes up does not push aside another that computes
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     import jax
 
     with contextlib.suppress(RuntimeError):  # JAX has started already (a notebook, a test): it keeps its devices
