@@ -31,6 +31,6 @@ def lidar(
     first = jnp.floor(place)
     past = place - first
     bins = first.astype(jnp.int32) % NUM_BINS  # rounding can make an angle of just below 0 into 2 pi
-    indices = jnp.concatenate([bins, (bins + 1) % NUM_BINS, (bins - 1) % NUM_BINS])
-    values = jnp.concatenate([closeness, past * closeness, (1 - past) * closeness])
-    return jnp.zeros(NUM_BINS, values.dtype).at[indices].max(values)
+    ahead = (jnp.arange(NUM_BINS)[:, None] - bins) % NUM_BINS  # [16, K]: how many bins further round than the object's
+    parts = jnp.select([ahead == 0, ahead == 1, ahead == NUM_BINS - 1], [1.0, past, 1 - past], 0.0)
+    return (parts * closeness).max(axis=1)
