@@ -22,13 +22,18 @@ def num_cpu_devices(num_seeds: int, num_cores: int, *, several: bool = False) ->
 
 
 def spread_seeds(num_seeds: int, *, several: bool = False) -> None:
-    """Asks JAX for that many CPU devices; no effect on accelerators. Call it before JAX is used."""
+    """Asks JAX for that many CPU devices, and Linux to schedule their threads as those of a batch job.
+
+    Accelerators take no notice. Call it before JAX is used.
+    """
     num_cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     num_devices = num_cpu_devices(num_seeds, num_cores, several=several)
     # Enough threads that each device's program can wait for a LAPACK kernel (see `program.run_mesh`); XLA reads the
     # size of its pool from this variable.
     os.environ.setdefault("PJRT_NPROC", str(num_cores + num_devices))
-    if hasattr(os, "SCHED_BATCH"):  # Linux: a thread that wakes up does not push aside another that computes
+    if hasattr(os, "SCHED_BATCH"):
+        # XLA wakes threads to help with small pieces of work: they must not push aside those that compute. Threads
+        # that start from here on inherit it.
         with contextlib.suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     import jax

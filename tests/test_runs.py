@@ -85,6 +85,19 @@ def test_devices_share_runs_evenly(num_runs: int, num_cores: int, several: bool,
     assert devices.num_cpu_devices(num_runs, num_cores, several=several) == expected
 
 
+@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="Linux only")
+def test_the_threads_of_a_training_are_scheduled_as_a_batch_job() -> None:
+    script = (
+        "import os; from experiments import devices; devices.spread_seeds(2);"
+        "import jax; before = set(os.listdir('/proc/self/task')); jax.numpy.ones(3).block_until_ready();"
+        "started = set(os.listdir('/proc/self/task')) - before; assert started;"
+        "print({os.sched_getscheduler(int(thread)) for thread in started} == {os.SCHED_BATCH})"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
+
+
 def test_only_traced_fields_may_differ() -> None:
     with pytest.raises(ConfigError, match="hidden_sizes"):
         runner.train_runs([walk_config(method="trpo"), walk_config(method="trpo", hidden_sizes=(5,))], Walk())
