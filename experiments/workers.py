@@ -21,6 +21,7 @@ LAUNCHERS = ("processes", "ray", "slurm")
 _PACKAGES = {"ray": "ray", "slurm": "submitit"}  # of the launchers, which are also names of extras
 _WRONG_INPUT = 2  # exit status; a second try would end in the same way
 _TRIES = 2
+_POLL_SECONDS = 2.0  # between two looks at SLURM jobs; submitit asks SLURM itself less often
 _LONGEST_JOB_MINUTES = 24 * 60  # submitit's own default is five
 
 Outcomes = Iterator[tuple[Path, str | None]]  # a program's folder and, if it failed, the last words of its worker
@@ -132,6 +133,9 @@ def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
 def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settings: Mapping[str, Any]) -> Outcomes:
     """An array of SLURM jobs through submitit, which runs them on this machine where there is no SLURM.
 
+    That a job was lost is known from SLURM's accounting (`sacct`). When nobody waits for them any longer, jobs are
+    cancelled.
+
     `settings` are parameters of `submitit.AutoExecutor`, such as timeout_min or slurm_partition.
     """
     import submitit
@@ -139,16 +143,27 @@ def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settin
     executor = submitit.AutoExecutor(folder=log_folder)
     defaults = {"name": "ccil_jax", "timeout_min": _LONGEST_JOB_MINUTES, "slurm_array_parallelism": num_workers}
     executor.update_parameters(**{**defaults, **settings})
-    jobs = executor.map_array(run_worker, folders)
-    for folder, job in zip(folders, jobs, strict=True):
-        failure: str | None = None
-        for attempt in range(_TRIES):
+    folder_of = dict(zip(executor.map_array(run_worker, folders), folders, strict=True))
+    jobs, running, lost = list(folder_of), set(folder_of), set()
+    try:
+        for job in submitit.helpers.as_completed(jobs, poll_frequency=_POLL_SECONDS):  # of `jobs` as it grows
+            running.remove(job)
+            folder, failure = folder_of[job], None
             try:
-                failure = (job if attempt == 0 else executor.submit(run_worker, folder)).result()
-                break
-            except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError) as error:
-                failure = f"lost by SLURM: {str(error).splitlines()[0]}"
-        yield folder, failure
+                failure = job.result()
+            except (submitit.core.utils.UncompletedJobError, submitit.core.utils.FailedJobError):
+                if folder not in lost:
+                    lost.add(folder)
+                    replacement = executor.submit(run_worker, folder)
+                    folder_of[replacement] = folder
+                    running.add(replacement)
+                    jobs.append(replacement)
+                    continue
+                failure = f"lost by SLURM: job {job.job_id} is {job.state}; see {job.paths.stderr}"
+            yield folder, failure
+    finally:
+        for job in running:
+            job.cancel(check=False)
 
 
 def _python_path() -> str:

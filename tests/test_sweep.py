@@ -221,6 +221,26 @@ def test_submitit_carries_programs_out(tmp_path: Path) -> None:
     assert (tmp_path / "runs" / "trpo" / "summary.json").exists()
 
 
+def die_once(folder: Path) -> None:
+    """In place of a worker: killed at the first try, and where the folder is called `always` at every try."""
+    died = (folder / "died").exists()
+    (folder / "died").touch()
+    if folder.name == "always" or not died:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_lost_slurm_job_is_replaced_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("submitit", reason="the extra slurm is not installed")
+    monkeypatch.setattr(workers, "run_worker", die_once)
+    folders = [tmp_path / name for name in ("once", "always")]
+    for folder in folders:
+        folder.mkdir()
+    outcomes = dict(workers.on_slurm(folders, 2, tmp_path / "slurm", {"timeout_min": 10}))
+    assert outcomes[folders[0]] is None
+    assert str(outcomes[folders[1]]).startswith("lost by SLURM: job ")
+    assert str(tmp_path / "slurm") in str(outcomes[folders[1]])
+
+
 @pytest.mark.parametrize(("launcher", "package"), [("ray", "ray"), ("slurm", "submitit")])
 def test_a_missing_extra_is_named(launcher: str, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
