@@ -26,6 +26,9 @@ from envs.base import Environment
 LONGEST_CHUNK = 10  # iterations between two looks from Python
 Varied = Mapping[str, jax.Array]  # traced fields that are not the same in all runs
 NONE_VARIED: Varied = MappingProxyType({})
+# XLA removes common subexpressions earlier from a program for several devices than from one for a single device, after
+# which it fuses, and so rounds, differently.
+_ALIKE_ON_ANY_DEVICES: dict[str, str | bool] = {"xla_disable_hlo_passes": "cse"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,11 +85,12 @@ def compile_program(
         num_runs: R.
         varied: values [R] of the traced fields of `config` that are not the same in all runs, by name.
         one_by_one: a device takes its runs in turn instead of side by side. Batched products are rounded otherwise
-            than single ones, so only then are the bits of a run the same however many share its device. XLA treats a
-            program for a single device differently, though: this holds among meshes of two devices or more.
+            than single ones, so only then are the bits of a run the same however many there are, on however many
+            devices.
     """
     chunk_length = min(LONGEST_CHUNK, config.num_iterations)
     mesh = run_mesh(num_runs)
+    compiler_options = _ALIKE_ON_ANY_DEVICES if one_by_one else None
 
     def init(config: Config, expert: ExpertData | None, varied: Varied, keys: jax.Array) -> GuardedState:
         def init_run(values: Varied, key: jax.Array) -> GuardedState:
@@ -130,14 +134,14 @@ def compile_program(
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), num_runs))
     shardings = (replicated, replicated, by_run, by_run)
     jitted_init = jax.jit(spread(init, P(), P()), in_shardings=shardings, out_shardings=by_run)
-    compiled_init = jitted_init.lower(config, expert, by_name, keys).compile()
+    compiled_init = jitted_init.lower(config, expert, by_name, keys).compile(compiler_options)
     state = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=by_run),
         jax.eval_shape(init, config, expert, by_name, keys),
     )
     jitted_chunk = jax.jit(spread(chunk, P(), P(), P()), donate_argnums=4)
     length = jax.device_put(np.int32(chunk_length), replicated)
-    compiled_chunk = jitted_chunk.lower(config, expert, length, by_name, state).compile()
+    compiled_chunk = jitted_chunk.lower(config, expert, length, by_name, state).compile(compiler_options)
 
     def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
         wanted = jax.device_put(np.int32(length), replicated)

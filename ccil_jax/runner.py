@@ -149,8 +149,8 @@ def train(
         demonstrations: needed by the imitation methods.
         num_seeds: S.
         seed: of the S keys; the same seed and S give the same bits.
-        one_by_one: each device takes its seeds in turn, which is slower. Then a seed's bits do not depend on how many
-            seeds there are, nor on the number of devices, as long as there are two or more.
+        one_by_one: each device takes its seeds in turn. Then a seed's bits depend neither on how many seeds there are
+            nor on how many devices.
         checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
         resume: continue from the newest intact checkpoint in `checkpoint_dir`.
         on_start: called once, before the first iteration, with the metrics of those that are done ({} if none is).

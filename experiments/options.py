@@ -40,8 +40,8 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
     add("seed", "base seed: the same seed, number of seeds and versions give the same bits", type=natural, metavar="N")
     add(
         "one_by_one",
-        "whether a device takes its seeds in turn: slower, but the bits of a seed then depend neither on the number of "
-        "seeds (two or more) nor of cores",
+        "whether a device takes its seeds in turn: its bits then depend neither on the number of seeds nor on that of "
+        "cores (runs in turn do not fill a GPU)",
         type=boolean,
         metavar="BOOL",
     )

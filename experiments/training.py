@@ -99,7 +99,7 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
             f"{first.config.method} on {first.task}: {several}{first.num_seeds} seed(s), "
             f"{_length(first.config)} each, into {checkpoint_dir.parent}; compiling ..."
         )
-        devices.spread_seeds(num_runs, several=first.one_by_one)
+        devices.spread_seeds(num_runs)
         import envs  # with JAX behind it: not before the input has been checked
 
         env = envs.make(first.task, physics=first.physics, **first.env_options)

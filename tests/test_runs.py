@@ -78,11 +78,10 @@ def test_stopped_and_resumed_together(results: list[Result], tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("num_runs", "num_cores", "several", "expected"),
-    [(8, 4, False, 4), (3, 4, False, 3), (8, 1, False, 1), (8, 1, True, 2), (3, 1, True, 3), (1, 4, True, 1)],
+    ("num_runs", "num_cores", "expected"), [(8, 4, 4), (3, 4, 3), (8, 1, 1), (8, 3, 4), (5, 4, 5), (7, 3, 1), (1, 4, 1)]
 )
-def test_devices_share_runs_evenly(num_runs: int, num_cores: int, several: bool, expected: int) -> None:
-    assert devices.num_cpu_devices(num_runs, num_cores, several=several) == expected
+def test_devices_share_runs_evenly(num_runs: int, num_cores: int, expected: int) -> None:
+    assert devices.num_cpu_devices(num_runs, num_cores) == expected
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="Linux only")
@@ -119,23 +118,31 @@ from ccil_jax.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 env, demonstrations = Walk(), walk_demonstrations()
-expert, keys = runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 2)
+expert, keys = runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 5)
 configs = [
     runner.resolve(walk_config(method=sys.argv[1], critic_learning_rate=rate), env, demonstrations)
     for rate in (0.01, 0.02, 0.05)
 ]
 shared, varied = runner.join(configs, num_seeds=2)
-alone = compile_program(configs[0], env, expert, 2, one_by_one=True)
+single = [compile_program(configs[0], env, expert, num_runs, one_by_one=True) for num_runs in (1, 5)]
 together = compile_program(shared, env, expert, 6, varied=varied, one_by_one=True)
 with quick_compilation():
     side_by_side = compile_program(shared, env, expert, 4, varied={k: v[:4] for k, v in varied.items()})
-expected, found = alone.chunk(alone.init(keys)), together.chunk(together.init(jax.numpy.tile(keys, 3)))
+
+def train(program, keys):
+    trained = program.chunk(program.init(keys))
+    return [jax.tree.map(lambda leaf: leaf[i], trained) for i in range(len(keys))]
+
+[alone], [first, *_, last] = train(single[0], keys[:1]), train(single[1], keys)
+found = train(together, jax.numpy.tile(keys[::4], 3))
+programs = (*single, together, side_by_side)
 print(json.dumps({
-    "devices": [len(program.state.agent.key.sharding.device_set) for program in (alone, together, side_by_side)],
-    "same": [same_bits(expected, jax.tree.map(lambda leaf: leaf[i : i + 2], found)) for i in (0, 2, 4)],
+    "devices": [len(program.state.agent.key.sharding.device_set) for program in programs],
+    "alone": same_bits(alone, first),
+    "same": [[same_bits(expected, run) for run in found] for expected in (first, last)],
     "collectives": [
         f"{name} of {i}" for name in ("all-reduce", "all-gather", "collective-permute", "all-to-all", "reduce-scatter")
-        for i, program in enumerate((alone, together, side_by_side)) if name in program.text()
+        for i, program in enumerate(programs) if name in program.text()
     ],
 }))
 """
@@ -143,13 +150,15 @@ print(json.dumps({
 
 @pytest.mark.parametrize("method", ["trpo", pytest.param("malm", marks=pytest.mark.slow)])
 def test_devices_share_runs_without_a_word(method: str) -> None:
-    """Four CPU devices: nothing travels between them; taken in turn, a run has the same bits in any company."""
+    """Four CPU devices: nothing travels between them; in turn, a run has the bits that it has on one, or alone."""
     environment = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=4", "PJRT_NPROC": "16"}
     environment["PYTHONPATH"] = str(Path(__file__).parent.parent)
     command = [sys.executable, "-c", ON_FOUR_DEVICES, method]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout) == {"devices": [2, 3, 4], "same": [True, False, False], "collectives": []}
+    found = json.loads(done.stdout)
+    assert found.pop("same") == [[i == 0 for i in range(6)], [i == 1 for i in range(6)]]
+    assert found == {"devices": [1, 1, 3, 4], "alone": True, "collectives": []}
 
 
 def test_compiled_programs_are_kept_unless_the_user_says_otherwise(
