@@ -145,7 +145,8 @@ def compile_program(
 
     def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
         wanted = jax.device_put(np.int32(length), replicated)
-        return compiled_chunk(config, expert, wanted, by_name, state)
+        with jax.transfer_guard("disallow"):  # all else is on the devices, and stays there
+            return compiled_chunk(config, expert, wanted, by_name, state)
 
     return Program(
         init=lambda keys: compiled_init(config, expert, by_name, jax.device_put(keys, by_run)),

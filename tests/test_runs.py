@@ -1,7 +1,9 @@
 """Several configurations in one program: each run has its own numbers, and shares nothing with the others."""
 
+import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,8 +13,10 @@ import jax
 import numpy as np
 import pytest
 
+import envs
 from ccil_jax import runner
 from ccil_jax.config import Config, ConfigError
+from ccil_jax.program import compile_program
 from ccil_jax.runner import Result
 from experiments import devices
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
@@ -159,6 +163,23 @@ def test_devices_share_runs_without_a_word(method: str) -> None:
     found = json.loads(done.stdout)
     assert found.pop("same") == [[i == 0 for i in range(6)], [i == 1 for i in range(6)]]
     assert found == {"devices": [1, 1, 3, 4], "alone": True, "collectives": []}
+
+
+def test_a_chunk_of_iterations_stays_on_its_device() -> None:
+    """A compiled iteration over MJX physics does not speak to the host, and what it needs is refused from there."""
+    env = envs.make("Swimmer", physics="mjx")
+    small = runner.resolve(walk_config(method="trpo", cost_limit=None), env, None)
+    with quick_compilation():
+        program = compile_program(small, env, None, 1)
+    calls = set(re.findall(r'custom_call_target="([^"]+)"', program.text()))
+    assert calls <= {"lapack_spotrf_ffi", "lapack_strsm_ffi"}  # MJX factorises
+    assert not re.findall(r" (infeed|outfeed|send|recv)\(", program.text())
+
+    state, metrics = program.chunk(program.init(jax.random.split(jax.random.key(0), 1)), 1)
+    assert np.isfinite(metrics["surrogate"]).all()
+    fetched = dataclasses.replace(state, agent=dataclasses.replace(state.agent, cost_rate=np.zeros(1, np.float32)))
+    with pytest.raises(Exception, match="Disallowed host-to-device transfer"):
+        program.chunk(fetched)
 
 
 def test_compiled_programs_are_kept_unless_the_user_says_otherwise(
