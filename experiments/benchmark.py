@@ -6,6 +6,7 @@ turn, and medians are reported, so that other work on the machine spoils a round
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import METHOD_NAMES, PRESETS
+from ccil_jax.config import METHOD_NAMES, PRESETS, Config
 from ccil_jax.versions import versions
 from envs.registry import PHYSICS
 from experiments import command_line, devices, options, peers, run_folder
@@ -29,7 +30,14 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--num-seeds", nargs="+", type=positive, default=[1, 8], metavar="S", help="one row for each (default: 1 8)"
     )
-    parser.add_argument("--num-envs", type=positive, default=16, metavar="N", help="per seed (default: 16)")
+    parser.add_argument(
+        "--num-envs",
+        nargs="+",
+        type=positive,
+        default=[16],
+        metavar="N",
+        help="per seed; one row for each (default: 16)",
+    )
     parser.add_argument("--method", default="malm", choices=METHOD_NAMES, help="what is trained (default: malm)")
     parser.add_argument("--physics", default="auto", choices=PHYSICS, help="engine (default: auto)")
     parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="hyperparameters (default: paper)")
@@ -37,7 +45,7 @@ def make_parser() -> Parser:
         "--batch-size",
         type=positive,
         metavar="K",
-        help="steps per batch, where an engine is slow (default: the preset's)",
+        help="steps per batch, where an engine is slow (default: the preset's, or the next multiple of N)",
     )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter measurements, for a first look")
     parser.add_argument("--seed", default=0, type=command_line.natural, metavar="N", help="base seed (default: 0)")
@@ -57,25 +65,35 @@ def make_parser() -> Parser:
 
 def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """One setting (see `measuring.Setting`) per row. Raises `UsageError` or `ConfigError` for wrong input."""
-    changes = {} if arguments.batch_size is None else {"batch_size": arguments.batch_size}
-    method = {"method": arguments.method, "num_envs": arguments.num_envs, "cost_limit": 0.0}
-    options.config_from({**method, **changes}, arguments.preset)
+    changes = {}
+    for num_envs in arguments.num_envs:
+        batch_size = arguments.batch_size or _batch_size(arguments.preset, num_envs)
+        changes[num_envs] = {"batch_size": batch_size}
+        chosen = {"method": arguments.method, "num_envs": num_envs, "cost_limit": 0.0, "batch_size": batch_size}
+        options.config_from(chosen, arguments.preset)
     return [
         {
             "task": options.find_task(task, "--tasks").name,
             "physics": arguments.physics,
             "method": arguments.method,
             "num_seeds": num_seeds,
-            "num_envs": arguments.num_envs,
+            "num_envs": num_envs,
             "preset": arguments.preset,
             "rounds": 2 if arguments.quick else 5,
             "seconds": 0.3 if arguments.quick else 2.0,
             "seed": arguments.seed,
-            "changes": changes,
+            "changes": changes[num_envs],
         }
         for task in arguments.tasks
         for num_seeds in arguments.num_seeds
+        for num_envs in arguments.num_envs
     ]
+
+
+def _batch_size(preset: str, num_envs: int) -> int:
+    """The preset's, or the next that `num_envs` simulations can fill."""
+    wanted = PRESETS[preset].get("batch_size", Config().batch_size)
+    return math.ceil(wanted / num_envs) * num_envs
 
 
 def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
@@ -87,9 +105,8 @@ def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: 
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
-        raise UsageError(
-            f"--tasks {setting['task']}, --num-seeds {setting['num_seeds']}: cannot be measured: {last[0]}"
-        )
+        which = f"--tasks {setting['task']}, --num-seeds {setting['num_seeds']}, --num-envs {setting['num_envs']}"
+        raise UsageError(f"{which}: cannot be measured: {last[0]}")
     row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return row
 
@@ -193,7 +210,8 @@ def run(arguments: argparse.Namespace) -> None:
         print_peers(compared)
         settings = []
     for setting in settings:
-        print(f"measuring {setting['task']}, {setting['num_seeds']} seed(s) ...", file=sys.stderr, flush=True)
+        size = f"{setting['num_seeds']} x {setting['num_envs']}"
+        print(f"measuring {setting['task']}, {size} ...", file=sys.stderr, flush=True)
         rows.append(measure_row(setting, "benchmark", *(["--profile"] if arguments.profile else [])))
         run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
     if arguments.profile:

@@ -105,6 +105,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         "training_steps_per_second": median["training"],
         "rollout_to_physics": median["rollout"] / median["physics"],
         "training_to_physics": median["training"] / median["physics"],
+        "training_to_rollout": median["training"] / median["rollout"],
         "meta_gradient_to_policy_step": median["plain"] / median["meta"],
         "policy_step_seconds": 1 / median["plain"],
         "meta_gradient_seconds": 1 / median["meta"],
@@ -123,7 +124,10 @@ def rate_of(work: Work, seconds: float) -> float:
 
 
 def _peak_memory() -> float:
-    """Largest resident size of this process so far, MiB: `peak_memory` of a row."""
+    """`peak_memory` of a row, MiB: the most that was allocated on the accelerators, or else this process's size."""
+    on_devices = [device.memory_stats() for device in jax.local_devices()]
+    if all(on_devices):  # None on a CPU
+        return sum(stats["peak_bytes_in_use"] for stats in on_devices if stats) / 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 2**20 if sys.platform == "darwin" else peak / 2**10
 

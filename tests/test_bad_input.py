@@ -139,7 +139,7 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "report on nothing": (("report", "none"), "RUN_DIR none: no such folder"),
     "report on something else": (("report", "full"), "full/config.json: cannot be read"),
     "benchmark of what": (("benchmark", "--tasks", "Swimer"), "--tasks Swimer: unknown task; did you mean Swimmer?"),
-    "benchmark not divisible": (("benchmark", "--num-envs", "17"), "--num-envs 17"),
+    "benchmark not divisible": (("benchmark", "--num-envs", "17", "--batch-size", "2000"), "--num-envs 17"),
     "benchmark to nowhere": (("benchmark", "--out", "good.npz/b.json"), "--out good.npz: cannot be written"),
     "sweep of what": (("sweep", "none.toml", "--out", "run"), "SPEC none.toml: cannot be read (No such file"),
     "ablations of what": (("ablations", "--out", "run"), "--env: required"),

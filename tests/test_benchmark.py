@@ -48,6 +48,15 @@ def test_a_peer_that_fails_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         peers.compare({"a": Path(sys.executable)}, lambda *_: {})
 
 
+def test_rows_are_all_sizes_of_all_tasks() -> None:
+    arguments = ["--tasks", "Swimmer", "Ant", "--num-seeds", "1", "32", "--num-envs", "16", "4096", "--preset", "paper"]
+    settings = benchmark.settings_of(benchmark.make_parser().parse_args(arguments))
+    assert [(s["task"], s["num_seeds"], s["num_envs"]) for s in settings] == [
+        (task, seeds, envs) for task in ("Swimmer", "Ant") for seeds in (1, 32) for envs in (16, 4096)
+    ]
+    assert {s["num_envs"]: s["changes"]["batch_size"] for s in settings} == {16: 2000, 4096: 4096}
+
+
 def test_missing_environments_of_peers_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as end:
         benchmark.main(["--peers", str(tmp_path), "--out", str(tmp_path / "benchmark.json")])
