@@ -147,7 +147,7 @@ def test_both_kinds_of_call_agree(cheetah: NativePhysics, monkeypatch: pytest.Mo
 
 def test_more_sizes_of_batches_than_an_engine_keeps(cheetah: NativePhysics) -> None:
     """Those that are idle make room, and the results do not depend on it."""
-    qpos, qvel, ctrl = starts(foreign._POOL_SIZE + 3, 9)
+    qpos, qvel, ctrl = starts(foreign.POOL_SIZE + 3, 9)
     bits = np.asarray(jax.vmap(cheetah.init)(qpos, qvel).backend)
     engine, ctrl = cheetah._engine, ctrl.astype(np.float32)
     together = engine._on_host(False, bits, ctrl)

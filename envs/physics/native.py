@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 
 from envs.physics.base import Data, Mocap
 from envs.physics.bits import float64_bits
-from envs.physics.foreign import STATE, Copy, Engine
+from envs.physics.engine import STATE, Copy, Engine
 
 _STATE_NAMES = frozenset({"qpos", "qvel"})
 

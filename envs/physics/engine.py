@@ -1,0 +1,215 @@
+"""C MuJoCo as a function of a jitted program: what the foreign functions must know of a model, and their calls."""
+
+import copy
+import ctypes
+import dataclasses
+import functools
+import hashlib
+import sys
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.physics import foreign
+
+# Arrays that MuJoCo fills only on demand, by `mj_rnePostConstraint`, which batches do not call themselves.
+POST_CONSTRAINT = frozenset({"cacc", "cfrc_int", "cfrc_ext"})
+STATE = -1  # as the source of a `Copy`: the state, not a derived array
+
+_INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+@dataclasses.dataclass(frozen=True)
+class Copy:
+    """One output of a call: columns of the state, or a derived array, and where they go."""
+
+    source: int  # number of the derived array, or `STATE`
+    start: int  # first column, where it is the state
+    size: int
+    into_row: bool  # of the engine's own row, or of the outputs
+    target: int  # first column there
+    change: int = -1  # if not negative, what is written is the difference to the old row from this column on
+
+
+class Engine:
+    """Steps any number of simulations of one model; in a jitted program or, on an accelerator's host, called by it.
+
+    Args:
+        model: copied.
+        num_threads: of one call.
+        num_substeps: engine steps per call of `step`.
+        last_stage: the `mjtStage` up to which the forward pass is carried out after them; 0 for none.
+        num_state: float64 columns of a row that are the state: `mjtState` components up to the warm start.
+        row_size: float64 columns of a row, derived arrays behind the state included.
+        output_size: columns of the outputs.
+        derived: names of `MjData` arrays.
+        copies: what is written where; all other columns are undefined.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        num_threads: int,
+        num_substeps: int,
+        last_stage: int,
+        num_state: int,
+        row_size: int,
+        output_size: int,
+        derived: Sequence[str],
+        copies: Sequence[Copy],
+    ) -> None:
+        self._sizes = row_size, output_size
+        facts = (num_threads, num_substeps, last_stage, num_state, row_size, output_size, *derived, *copies)
+        serialized = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, serialized)
+        digest = hashlib.sha256(repr(facts).encode() + serialized.tobytes()).digest()
+        self._key = int.from_bytes(digest[:7], "little")
+        with _lock_of_engines:
+            if self._key in _known:
+                return
+            model = copy.copy(model)
+            names = [ctypes.create_string_buffer(name.encode()) for name in derived]
+            arrays = np.array(
+                [
+                    (ctypes.addressof(names[i]), *where, derived[i] in POST_CONSTRAINT)
+                    for i, where in enumerate(_locate(model, derived))
+                ],
+                np.int64,
+            )
+            copy_table = np.array([dataclasses.astuple(one) for one in copies], np.int64)
+            pool = np.zeros((foreign.POOL_SIZE, foreign.DERIVED + len(derived)), np.int64)
+            engine = np.zeros(foreign.ENGINE_SIZE, np.int64)
+            ctypes.CDLL(None).pthread_mutex_init(ctypes.c_void_p(engine.ctypes.data), None)
+            for field, value in {
+                foreign.MODEL: model._address,
+                foreign.THREADS: num_threads,
+                foreign.NUM_STATE: num_state,
+                foreign.ROW: row_size,
+                foreign.OUTPUT: output_size,
+                foreign.NUM_CTRL: model.nu,
+                foreign.NUM_MOCAP: model.nmocap,
+                foreign.NUM_SUBSTEPS: num_substeps,
+                foreign.LAST_STAGE: last_stage,
+                foreign.POST: bool(POST_CONSTRAINT.intersection(derived)),
+                foreign.CTRL: _column(model, mujoco.mjtState.mjSTATE_CTRL),
+                foreign.QUAT: _column(model, mujoco.mjtState.mjSTATE_MOCAP_QUAT),
+                foreign.POS: _column(model, mujoco.mjtState.mjSTATE_MOCAP_POS),
+                foreign.NUM_DERIVED: len(derived),
+                foreign.ARRAYS: arrays.ctypes.data,
+                foreign.NUM_COPIES: len(copies),
+                foreign.COPIES: copy_table.ctypes.data,
+                foreign.POOL: pool.ctypes.data,
+                foreign.ADVANCE: foreign.advance_one.address,
+                foreign.ACC: int(mujoco.mjtStage.mjSTAGE_ACC),
+                foreign.NUM_WARNINGS: int(mujoco.mjtWarning.mjNWARNING),
+            }.items():
+                engine[field] = value
+            reasons = (
+                mujoco.mjtWarning.mjWARN_BADQPOS,
+                mujoco.mjtWarning.mjWARN_BADQVEL,
+                mujoco.mjtWarning.mjWARN_BADQACC,
+            )
+            engine[foreign.DIVERGED :] = [int(reason) for reason in reasons]
+            _enter(self._key, engine, (model, names, arrays, copy_table, pool))
+
+    def step(self, bits: jax.Array, ctrl: jax.Array, *poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Advances one control step; vmapped, all simulations together.
+
+        Args:
+            bits: [2 row_size] uint32, the row.
+            ctrl: [nu].
+            poses: none, or quaternions [4 nmocap] and positions [3 nmocap] or [num_substeps 3 nmocap].
+
+        Returns:
+            The new row's bits, and [output_size] outputs; NaN where the simulation diverged or MuJoCo raised an error.
+        """
+        return self._call(foreign.STEP, bits, ctrl, *poses)
+
+    def forward(self, bits: jax.Array, ctrl: jax.Array, *poses: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The forward pass alone, as `step` else."""
+        return self._call(foreign.FORWARD, bits, ctrl, *poses)
+
+    def _call(self, name: str, bits: jax.Array, *inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        dtype = jnp.result_type(float)
+        row_size, output_size = self._sizes
+        shapes = jax.ShapeDtypeStruct((2 * row_size,), jnp.uint32), jax.ShapeDtypeStruct((output_size,), dtype)
+        arguments = (bits, *(jnp.asarray(x, dtype) for x in inputs))
+        if jax.default_backend() == "cpu":
+            _register()
+            call = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all")
+            new, values = call(*arguments, key=np.int64(self._key))
+            return new, values
+        host = functools.partial(self._on_host, name == foreign.FORWARD)
+        return jax.pure_callback(host, shapes, *arguments, vmap_method="broadcast_all")
+
+    def _on_host(self, forward: bool, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+        """What the foreign functions do, on arrays of the host."""
+        old, ctrl, *poses = [np.ascontiguousarray(x) for x in arguments]
+        lead, (row_size, output_size) = old.shape[:-1], self._sizes
+        new = np.empty((*lead, 2 * row_size), np.uint32)
+        values = np.empty((*lead, output_size), ctrl.dtype)
+        num_sims = int(np.prod(lead, dtype=int))
+        num_places = poses[1].size // (3 * poses[0].size // 4) if poses else 0
+        quat, pos = [x.ctypes.data for x in poses] or [0, 0]
+        engine = _known[self._key][0].ctypes.data
+        wide = ctrl.dtype == np.float64
+        foreign.run(
+            engine,
+            forward,
+            num_sims,
+            old.ctypes.data,
+            ctrl.ctypes.data,
+            quat,
+            pos,
+            num_places,
+            new.ctypes.data,
+            values.ctypes.data,
+            wide,
+        )
+        return new, values
+
+
+_lock_of_engines = threading.Lock()
+_known: dict[int, tuple[np.ndarray, Any]] = {}  # every engine of this process, and what it points to
+
+
+def _enter(key: int, engine: np.ndarray, kept: Any) -> None:
+    """Enters an engine into the table. It stays: a compiled program may outlive its environment, and has the key."""
+    count = len(_known)
+    if count == foreign.TABLE_SIZE:
+        raise RuntimeError(f"{foreign.TABLE_SIZE} different physics in one process; make fewer, they are kept")
+    _known[key] = engine, kept
+    foreign.engines[1 + 2 * count : 3 + 2 * count] = key, engine.ctypes.data
+    foreign.engines[0] = count + 1
+
+
+@functools.cache
+def _register() -> None:
+    """Tells XLA of the foreign functions."""
+    for name, function in ((foreign.STEP, foreign.on_step), (foreign.FORWARD, foreign.on_forward)):
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function.ctypes), platform="cpu")
+
+
+def _column(model: mujoco.MjModel, component: mujoco.mjtState) -> int:
+    """The first column of a component in a row of the integration state, whose order is that of the bits."""
+    return mujoco.mj_stateSize(model, _INTEGRATION & (int(component) - 1))
+
+
+def _locate(model: mujoco.MjModel, names: Sequence[str]) -> list[tuple[int, int]]:
+    """Where in C's mjData, in words of 8 bytes, the pointers to these arrays stand, and how long the arrays are.
+
+    Found by value: the layout is not to be had from Python.
+    """
+    data = mujoco.MjData(model)
+    measure = getattr(ctypes.CDLL(None), "malloc_size" if sys.platform == "darwin" else "malloc_usable_size")
+    measure.argtypes, measure.restype = [ctypes.c_void_p], ctypes.c_size_t
+    words = np.ctypeslib.as_array((ctypes.c_int64 * (measure(data._address) // 8)).from_address(data._address))
+    arrays = [getattr(data, name) for name in names]
+    # Empty arrays before it have the same address.
+    return [(int(np.flatnonzero(words == array.ctypes.data)[-1]), array.size) for array in arrays]
