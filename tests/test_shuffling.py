@@ -2,15 +2,21 @@
 
 import jax
 import numpy as np
+import pytest
 
 from ccil_jax import shuffling
 
 
-def test_a_permutation_holds_every_index_once() -> None:
-    one, two = (np.asarray(shuffling.permutation(jax.random.key(seed), 50)) for seed in (0, 1))
-    np.testing.assert_array_equal(np.sort(one), np.arange(50))
-    assert (one != two).any()
-    assert (one != np.arange(50)).any()
+@pytest.mark.parametrize("num_samples", [50, 4096, 4097])  # by one sort of either kind
+def test_a_permutation_holds_every_index_once(num_samples: int) -> None:
+    one, two = (np.asarray(shuffling.permutation(jax.random.key(seed), num_samples)) for seed in (0, 1))
+    np.testing.assert_array_equal(np.sort(one), np.arange(num_samples))
+    for before, after in ((one, two), (np.arange(num_samples), one), (one[:-1], one[1:])):
+        assert abs(np.corrcoef(before, after)[0, 1]) < 4 / np.sqrt(num_samples)  # four standard errors
+
+
+def test_a_single_sample_has_one_order() -> None:
+    np.testing.assert_array_equal(shuffling.permutation(jax.random.key(0), 1), [0])
 
 
 def test_every_first_index_is_about_as_likely() -> None:
