@@ -4,9 +4,11 @@ A run is a seed with its traced hyperparameters.
 """
 
 import dataclasses
+import operator
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from types import MappingProxyType
 from typing import Any
 
@@ -24,11 +26,8 @@ from ccil_jax.types import ExpertData, Metrics
 from envs.base import Environment
 
 LONGEST_CHUNK = 10  # iterations between two looks from Python
-Varied = Mapping[str, jax.Array]  # traced fields that are not the same in all runs
+Varied = Mapping[str, jax.Array]  # [R]: traced fields that are not the same in all runs
 NONE_VARIED: Varied = MappingProxyType({})
-# XLA removes common subexpressions earlier from a program for several devices than from one for a single device, after
-# which it fuses, and so rounds, differently.
-_ALIKE_ON_ANY_DEVICES: dict[str, str | bool] = {"xla_disable_hlo_passes": "cse"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,14 +52,18 @@ def run_mesh(num_runs: int) -> jax.sharding.Mesh:
         num_threads = int(os.environ.get("PJRT_NPROC") or os.cpu_count() or 1)
         devices = devices[: max(1, num_threads - 1)]
     size = max(n for n in range(1, len(devices) + 1) if num_runs % n == 0)
-    return jax.make_mesh((size,), ("runs",), axis_types=(AxisType.Auto,), devices=devices[:size])
+    return _mesh(devices[:size])
 
 
-def over_runs(function: Callable[..., Any], one_by_one: bool) -> Callable[..., Any]:
-    """`function` of one run as a function of several, [R]-leading: side by side, or in turn."""
-    if one_by_one:
-        return lambda *arguments: jax.lax.map(lambda of_run: function(*of_run), arguments)
-    return jax.vmap(function)
+def _mesh(devices: Sequence[jax.Device]) -> jax.sharding.Mesh:
+    return jax.make_mesh((len(devices),), ("runs",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def _shapes(runs: Any, num_runs: int, sharding: NamedSharding) -> Any:
+    """Of as many runs, however many there are in `runs`."""
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct((num_runs, *leaf.shape[1:]), leaf.dtype, sharding=sharding), runs
+    )
 
 
 def make_agent(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
@@ -68,35 +71,26 @@ def make_agent(config: Config, env: Environment, expert: ExpertData | None) -> A
     return guard.protect(agents.make(config, env, expert), config.max_skipped_updates)
 
 
-def compile_program(
-    config: Config,
-    env: Environment,
-    expert: ExpertData | None,
-    num_runs: int,
-    varied: Varied = NONE_VARIED,
-    one_by_one: bool = False,
-) -> Program:
-    """`jit(vmap(loop(iteration)))` over runs, compiled once and spread over `run_mesh`.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Compiled:
+    """The functions of R runs, side by side, on the devices of one mesh."""
 
-    Args:
-        config: resolved.
-        env: one environment, unbatched.
-        expert: None for task rewards.
-        num_runs: R.
-        varied: values [R] of the traced fields of `config` that are not the same in all runs, by name.
-        one_by_one: a device takes its runs in turn instead of side by side. Batched products are rounded otherwise
-            than single ones, so only then are the bits of a run the same however many there are, on however many
-            devices.
-    """
-    chunk_length = min(LONGEST_CHUNK, config.num_iterations)
-    mesh = run_mesh(num_runs)
-    compiler_options = _ALIKE_ON_ANY_DEVICES if one_by_one else None
+    init: Callable[[Varied, jax.Array], GuardedState]
+    chunk: Callable[[Varied, GuardedState, int], tuple[GuardedState, Metrics]]
+    state: GuardedState
+    text: Callable[[], str]
+
+
+def _compiler(
+    config: Config, env: Environment, expert: ExpertData | None, varied: Varied, chunk_length: int
+) -> Callable[[int, jax.sharding.Mesh], _Compiled]:
+    """How many runs, and the devices that share them -> their functions."""
 
     def init(config: Config, expert: ExpertData | None, varied: Varied, keys: jax.Array) -> GuardedState:
         def init_run(values: Varied, key: jax.Array) -> GuardedState:
             return make_agent(config.replace(**values), env, expert).init(key)
 
-        return over_runs(init_run, one_by_one)(varied, keys)
+        return jax.vmap(init_run)(varied, keys)
 
     @jax.jit
     def step(config: Config, expert: ExpertData | None, state: GuardedState) -> tuple[GuardedState, Metrics]:
@@ -119,40 +113,116 @@ def compile_program(
 
             return jax.lax.fori_loop(0, length, turn, (state, blank))
 
-        return over_runs(iterate, one_by_one)(varied, state)
+        return jax.vmap(iterate)(varied, state)
 
-    def spread(function: Callable[..., Any], *replicated: P) -> Callable[..., Any]:
-        # Runs never communicate, so each device carries out its share of them as a program of its own.
-        return jax.shard_map(
-            function, mesh=mesh, in_specs=(*replicated, P("runs"), P("runs")), out_specs=P("runs"), check_vma=False
+    def compile_on(num_runs: int, mesh: jax.sharding.Mesh) -> _Compiled:
+        replicated, by_run = NamedSharding(mesh, P()), NamedSharding(mesh, P("runs"))
+
+        def spread(function: Callable[..., Any], *replicated: P) -> Callable[..., Any]:
+            # Runs never communicate, so each device carries out its share of them as a program of its own.
+            specs = (*replicated, P("runs"), P("runs"))
+            return jax.shard_map(function, mesh=mesh, in_specs=specs, out_specs=P("runs"), check_vma=False)
+
+        own = jax.device_put((config, expert), replicated)
+        values, keys = _shapes((dict(varied), jax.eval_shape(lambda: jax.random.key(0)[None])), num_runs, by_run)
+        jitted_init = jax.jit(spread(init, P(), P()), out_shardings=by_run)
+        compiled_init = jitted_init.lower(*own, values, keys).compile()
+        state = _shapes(jax.eval_shape(init, *own, values, keys), num_runs, by_run)
+        length = jax.device_put(np.int32(chunk_length), replicated)
+        jitted_chunk = jax.jit(spread(chunk, P(), P(), P()), donate_argnums=4)
+        compiled_chunk = jitted_chunk.lower(*own, length, values, state).compile()
+
+        def run(varied: Varied, state: GuardedState, length: int) -> tuple[GuardedState, Metrics]:
+            wanted = jax.device_put(np.int32(length), replicated)
+            with jax.transfer_guard("disallow"):  # all else is on the devices, and stays there
+                return compiled_chunk(*own, wanted, varied, state)
+
+        return _Compiled(
+            init=lambda varied, keys: compiled_init(*own, varied, keys),
+            chunk=run,
+            state=state,
+            text=lambda: compiled_chunk.as_text() or "",
         )
 
+    return compile_on
+
+
+def compile_program(
+    config: Config,
+    env: Environment,
+    expert: ExpertData | None,
+    num_runs: int,
+    varied: Varied = NONE_VARIED,
+    one_by_one: bool = False,
+) -> Program:
+    """`jit(vmap(loop(iteration)))` over runs, compiled and spread over `run_mesh`.
+
+    Args:
+        config: resolved.
+        env: one environment, unbatched.
+        expert: None for task rewards.
+        num_runs: R.
+        varied: values [R] of the traced fields of `config` that are not the same in all runs, by name.
+        one_by_one: a device takes its runs in turn instead of side by side. XLA rounds otherwise for two runs than for
+            three, and on two devices than on one, so what it compiles then is, for each device, the program of a
+            single run: the bits of a run are the same however many there are, on however many devices.
+    """
     start = time.perf_counter()
-    replicated, by_run = NamedSharding(mesh, P()), NamedSharding(mesh, P("runs"))
-    config, expert = jax.device_put((config, expert), replicated)
-    by_name = jax.device_put(dict(varied), by_run)
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), num_runs))
-    shardings = (replicated, replicated, by_run, by_run)
-    jitted_init = jax.jit(spread(init, P(), P()), in_shardings=shardings, out_shardings=by_run)
-    compiled_init = jitted_init.lower(config, expert, by_name, keys).compile(compiler_options)
-    state = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=by_run),
-        jax.eval_shape(init, config, expert, by_name, keys),
-    )
-    jitted_chunk = jax.jit(spread(chunk, P(), P(), P()), donate_argnums=4)
-    length = jax.device_put(np.int32(chunk_length), replicated)
-    compiled_chunk = jitted_chunk.lower(config, expert, length, by_name, state).compile(compiler_options)
-
-    def run(state: GuardedState, length: int = chunk_length) -> tuple[GuardedState, Metrics]:
-        wanted = jax.device_put(np.int32(length), replicated)
-        with jax.transfer_guard("disallow"):  # all else is on the devices, and stays there
-            return compiled_chunk(config, expert, wanted, by_name, state)
-
+    chunk_length = min(LONGEST_CHUNK, config.num_iterations)
+    mesh = run_mesh(num_runs)
+    by_run = NamedSharding(mesh, P("runs"))
+    values = jax.device_put(dict(varied), by_run)
+    compile_on = _compiler(config, env, expert, varied, chunk_length)
+    compiled = _in_turn(compile_on, by_run, num_runs) if one_by_one else compile_on(num_runs, mesh)
     return Program(
-        init=lambda keys: compiled_init(config, expert, by_name, jax.device_put(keys, by_run)),
-        chunk=run,
-        state=state,
+        init=lambda keys: compiled.init(values, jax.device_put(keys, by_run)),
+        chunk=lambda state, length=chunk_length: compiled.chunk(values, state, length),
+        state=_shapes(compiled.state, num_runs, by_run),
         chunk_length=chunk_length,
         compile_seconds=time.perf_counter() - start,
-        text=lambda: compiled_chunk.as_text() or "",
+        text=compiled.text,
+    )
+
+
+def _in_turn(
+    compile_on: Callable[[int, jax.sharding.Mesh], _Compiled], by_run: NamedSharding, num_runs: int
+) -> _Compiled:
+    """R runs, each carried out by the program of a single one, of which every device has its own."""
+    meshes = [_mesh([device]) for device in by_run.mesh.devices.flat]
+    with ThreadPoolExecutor(len(meshes)) as pool:
+        single = list(pool.map(lambda mesh: compile_on(1, mesh), meshes))
+
+    @jax.jit
+    def split(runs: Any) -> list[Any]:
+        return [jax.tree.map(operator.itemgetter(slice(i, i + 1)), runs) for i in range(num_runs // len(meshes))]
+
+    @jax.jit
+    def join(runs: Sequence[Any]) -> Any:
+        return jax.tree.map(lambda *rows: jnp.concatenate(rows), *runs)
+
+    def take_apart(runs: Any) -> list[tuple[Any, ...]]:
+        """By turn, of each device its own."""
+        shards = [jax.tree.map(lambda leaf: leaf.addressable_shards[i].data, runs) for i in range(len(meshes))]  # noqa: B023
+        return list(zip(*(split(shard) for shard in shards), strict=True))
+
+    def put_together(turns: Sequence[Sequence[Any]]) -> Any:
+        shards = [join(runs) for runs in zip(*turns, strict=True)]
+        return jax.tree.map(
+            lambda *parts: jax.make_array_from_single_device_arrays((num_runs, *parts[0].shape[1:]), by_run, parts),
+            *shards,
+        )
+
+    def call(function: Callable[[_Compiled], Callable[..., Any]], runs: Any, *arguments: Any) -> Any:
+        """Every device one run at a time: the first of each, then the second."""
+        done = []
+        for turn in take_apart(runs):
+            results = [function(compiled)(*own, *arguments) for compiled, own in zip(single, turn, strict=True)]
+            done.append(jax.block_until_ready(results))
+        return put_together(done)
+
+    return _Compiled(
+        init=lambda varied, keys: call(operator.attrgetter("init"), (varied, keys)),
+        chunk=lambda varied, state, length: call(operator.attrgetter("chunk"), (varied, state), length),
+        state=single[0].state,
+        text=single[0].text,
     )
