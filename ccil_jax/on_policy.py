@@ -16,7 +16,7 @@ from ccil_jax.distributions import Gaussian
 from ccil_jax.methods import METHODS
 from ccil_jax.policy_step import PolicyStep
 from ccil_jax.regression import Critic
-from ccil_jax.returns import gae
+from ccil_jax.returns import gae, successor_values
 from ccil_jax.reward_models import RewardModel
 from ccil_jax.rollout import Actor, RolloutState
 from ccil_jax.types import Batch, ExpertData, Metrics, PyTree, Transition
@@ -231,14 +231,21 @@ def assess(
     episodes: Episodes,
 ) -> tuple[Batch, jax.Array]:
     """Scores a batch: rewards, values, advantages and returns of both signals. Returns [K] samples and mean reward."""
-    normalize = running_statistics.normalize
-    obs = normalize(state.actor.obs_statistics, transition.obs)
-    next_obs = normalize(state.actor.obs_statistics, transition.next_obs)
+
+    def normalize(obs: jax.Array) -> jax.Array:
+        return running_statistics.normalize(state.actor.obs_statistics, obs)
+
+    def values(obs: jax.Array) -> jax.Array:
+        return jax.vmap(critic_apply, in_axes=(0, None))(state.critics.params, obs)
+
+    obs = normalize(transition.obs)
     reward = reward_model.reward(state.reward_model, transition)
     signals = jnp.stack([reward, transition.cost])
-    values = jax.vmap(critic_apply, in_axes=(0, None))
-    value, next_value = values(state.critics.params, obs), values(state.critics.params, next_obs)
     no_future = transition.terminated if config.bootstrap_at_truncation else transition.done
+    value = values(obs)
+    next_value = successor_values(
+        lambda obs: values(normalize(obs)), value, transition.next_obs, no_future, transition.done
+    )
     lambdas = jnp.stack([jnp.asarray(config.gae_lambda), jnp.asarray(config.cost_gae_lambda)])
     both = jax.vmap(gae, in_axes=(0, 0, 0, None, None, None, 0))
     advantage, returns = both(signals, value, next_value, no_future, transition.done, config.gamma, lambdas)

@@ -1,5 +1,7 @@
 """Generalised advantage estimation (Schulman et al. 2016), the same function for reward and cost."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -38,3 +40,34 @@ def gae(
 
     _, advantage = jax.lax.scan(backwards, jnp.zeros_like(residual[0]), (residual, decay), reverse=True)
     return advantage, advantage + value
+
+
+def successor_values(
+    evaluate: Callable[[Float[Array, "N D"]], Float[Array, "... N"]],
+    value: Float[Array, "... T N"],
+    next_obs: Float[Array, "T N D"],
+    no_future: Bool[Array, "T N"],
+    done: Bool[Array, "T N"],
+) -> Float[Array, "... T N"]:
+    """What critics say of the successors: `evaluate(next_obs[t])` for every t, where there is a future.
+
+    Within an episode the successor is the next step's observation, whose value is known. What is left is the last step
+    and those with a time limit's: few, so that evaluating them one by one is cheaper than evaluating all.
+
+    Args:
+        evaluate: the critics, of one step's observations.
+        value: the critics at `obs`.
+        next_obs: the true successors.
+        no_future: steps whose successor does not count.
+        done: steps whose successor is not the next step's observation.
+    """
+
+    def fill(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        values, unknown = carry
+        step = jnp.argmax(jnp.any(unknown, axis=-1))
+        known = jnp.where(unknown[step], evaluate(next_obs[step]), values[..., step, :])
+        return values.at[..., step, :].set(known), unknown.at[step].set(False)
+
+    unknown = (done & ~no_future).at[-1].set(True)
+    start = (jnp.roll(value, -1, axis=-2), unknown)
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[1]), fill, start)[0]

@@ -44,6 +44,20 @@ MUTATIONS = (
         ("tests/test_episodes.py", "tests/test_probe_envs.py"),
     ),
     Mutation(
+        "at a time limit the value is that of the next episode's beginning",
+        "ccil_jax/returns.py",
+        "(done & ~no_future).at[-1]",
+        "jnp.zeros_like(done).at[-1]",
+        ("tests/test_returns.py",),
+    ),
+    Mutation(
+        "the batch's last values are followed by its first",
+        "ccil_jax/returns.py",
+        "(done & ~no_future).at[-1].set(True)",
+        "done & ~no_future",
+        ("tests/test_returns.py",),
+    ),
+    Mutation(
         "the discriminator's labels change places",
         "ccil_jax/reward_models.py",
         "loss = jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(learner_logits))",

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax.returns import gae
+from ccil_jax.returns import gae, successor_values
 from tests.probe_envs import gae_by_loop
 
 
@@ -52,3 +52,34 @@ def test_bootstraps_from_the_true_successor_and_not_from_the_reset_state() -> No
     value, next_value = jnp.array([[1.0], [-10.0]]), jnp.array([[10.0], [1.0]])
     advantage, _ = gae(signal, value, next_value, jnp.zeros((2, 1), bool), done, 0.5, 0.9)
     assert advantage[0, 0] == 0.5 * 10.0 - 1.0  # from the reset state it would be 0.5 * -10 - 1
+
+
+@pytest.mark.parametrize("bootstrap_at_truncation", [True, False])
+def test_values_of_successors_are_those_of_every_successor_evaluated(bootstrap_at_truncation: bool) -> None:
+    """Runs side by side, with as many truncations as they happen to have, two critics each."""
+    num_runs, num_steps, num_envs, obs_size = 3, 30, 5, 4
+    rng = np.random.default_rng(0)
+    weights = rng.normal(size=(num_runs, 2, obs_size))
+    obs, last = rng.normal(size=(num_runs, num_steps, num_envs, obs_size)), rng.normal(size=(num_runs, 1, num_envs, 4))
+    terminated, truncated = rng.uniform(size=(2, num_runs, num_steps, num_envs)) < 0.1
+    truncated[1] = False  # a run without a time limit
+    truncated[2, :, 0] = True  # and one with a truncation in every step
+    done = terminated | truncated
+    no_future = terminated if bootstrap_at_truncation else done
+    next_obs = np.concatenate([obs[:, 1:], last], axis=1)
+    next_obs[done] = rng.normal(size=(int(done.sum()), obs_size))  # the episode's own end, not the next one's beginning
+
+    def of_run(
+        weights: jax.Array, obs: jax.Array, next_obs: jax.Array, no_future: jax.Array, done: jax.Array
+    ) -> jax.Array:
+        def evaluate(obs: jax.Array) -> jax.Array:
+            return jnp.tanh(jnp.einsum("cd,...nd->c...n", weights, obs))
+
+        return successor_values(evaluate, evaluate(obs), next_obs, no_future, done)
+
+    with jax.enable_x64(True):
+        found = jax.jit(jax.vmap(of_run))(*[jnp.asarray(x) for x in (weights, obs, next_obs, no_future, done)])
+    expected = np.tanh(np.einsum("rcd,rtnd->rctn", weights, next_obs))
+    counts = np.broadcast_to(~no_future[:, None], expected.shape)
+    np.testing.assert_allclose(np.asarray(found)[counts], expected[counts], rtol=1e-12)
+    assert np.all(np.isfinite(found))  # those without a future are multiplied by zero
