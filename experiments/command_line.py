@@ -64,6 +64,7 @@ def _hyphenated(token: str) -> str:
 def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None], argv: Sequence[str] | None) -> int:
     """Parses and runs; wrong input found later than parsing ends in the same one line and exit status 2."""
     arguments = parser.parse_args(argv)
+    devices.widen_vectors()
     devices.keep_programs()
     try:
         return run(arguments) or 0

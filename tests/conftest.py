@@ -15,6 +15,8 @@ import jaxtyping
 import pytest
 from hypothesis import settings
 
+from experiments import devices
+
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ccil_jax" / "tests"
 ENVIRONMENT = {  # read when the packages are imported, here and in the tests' subprocesses
     "JAX_PLATFORMS": "cpu",
@@ -28,6 +30,7 @@ ENVIRONMENT = {  # read when the packages are imported, here and in the tests' s
 assert "jax" not in sys.modules, "imported too early to be set"
 for variable, value in ENVIRONMENT.items():
     os.environ.setdefault(variable, value)
+devices.widen_vectors()  # as in launchers, whose results some tests compare with those of this process
 
 # The first call of a jitted function compiles, so no example has a deadline. The same examples on every run.
 settings.register_profile("tests", deadline=None, derandomize=True)

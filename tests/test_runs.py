@@ -182,6 +182,29 @@ def test_a_chunk_of_iterations_stays_on_its_device() -> None:
         program.chunk(fetched)
 
 
+def test_vectors_are_as_wide_as_the_processor_has_them_unless_the_user_says_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(devices, "_processor_features", lambda: "flags : sse2 avx512f avx512_bf16")
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    devices.widen_vectors()
+    devices.widen_vectors()
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=512"
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    devices.widen_vectors()
+    assert os.environ["XLA_FLAGS"].split() == [
+        "--xla_force_host_platform_device_count=2",
+        "--xla_cpu_prefer_vector_width=512",
+    ]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
+    devices.widen_vectors()
+    assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=128"
+    monkeypatch.setattr(devices, "_processor_features", lambda: "flags : sse2 avx512f")
+    monkeypatch.delenv("XLA_FLAGS")
+    devices.widen_vectors()
+    assert "XLA_FLAGS" not in os.environ
+
+
 def test_compiled_programs_are_kept_unless_the_user_says_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
