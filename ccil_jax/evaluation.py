@@ -13,7 +13,7 @@ from ccil_jax import networks
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.rollout import Actor, act
-from envs.base import Environment, State
+from envs.base import Environment, State, full_precision
 
 
 @struct.dataclass(kw_only=True)
@@ -41,6 +41,7 @@ class Episodes:
 Act = Callable[[jax.Array, jax.Array], jax.Array]  # obs [N, obs_dim], key -> action [N, action_dim]
 
 
+@full_precision
 def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Array) -> Episodes:
     """Runs `num_episodes` episodes side by side from fresh resets to their ends."""
     reset_key, key = jax.random.split(key)

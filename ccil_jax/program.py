@@ -23,7 +23,7 @@ from ccil_jax.config import Config
 from ccil_jax.guard import GuardedState
 from ccil_jax.on_policy import Agent
 from ccil_jax.types import ExpertData, Metrics
-from envs.base import Environment
+from envs.base import Environment, full_precision
 
 LONGEST_CHUNK = 10  # iterations between two looks from Python
 Varied = Mapping[str, jax.Array]  # [R]: traced fields that are not the same in all runs
@@ -68,7 +68,8 @@ def _shapes(runs: Any, num_runs: int, sharding: NamedSharding) -> Any:
 
 def make_agent(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     """The agent of `config.method`, guarded against numbers that are not finite."""
-    return guard.protect(agents.make(config, env, expert), config.max_skipped_updates)
+    agent = guard.protect(agents.make(config, env, expert), config.max_skipped_updates)
+    return Agent(init=full_precision(agent.init), step=full_precision(agent.step))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

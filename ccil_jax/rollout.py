@@ -11,7 +11,7 @@ from ccil_jax import distributions, running_statistics
 from ccil_jax.distributions import Gaussian, TanhGaussian
 from ccil_jax.running_statistics import RunningStatistics
 from ccil_jax.types import PyTree, Transition
-from envs.base import Environment, State, compute_where
+from envs.base import Environment, State, compute_where, full_precision
 
 
 @struct.dataclass(kw_only=True)
@@ -34,6 +34,7 @@ class RolloutState:
 PolicyApply = Callable[[PyTree, jax.Array], Gaussian] | Callable[[PyTree, jax.Array], TanhGaussian]
 
 
+@full_precision
 def act(policy_apply: PolicyApply, actor: Actor, obs: jax.Array, noise: jax.Array) -> jax.Array:
     """Actions [..., action_dim] for standard normal `noise`; zero noise gives the mode."""
     distribution = policy_apply(actor.policy_params, running_statistics.normalize(actor.obs_statistics, obs))

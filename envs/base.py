@@ -4,8 +4,9 @@ An environment is a set of pure functions of one simulation; callers `vmap` them
 Auto-reset is not here: `ccil_jax.rollout` owns it, so `step` always returns the true successor.
 """
 
+import functools
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from flax import struct
 
 PyTree = Any
 Tree = TypeVar("Tree")
+Arguments = ParamSpec("Arguments")
 
 
 @struct.dataclass(kw_only=True)
@@ -123,6 +125,21 @@ class Environment(Protocol):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. `action` is `[action_dim]`; stepping a done state is undefined."""
+
+
+def full_precision(function: Callable[Arguments, Tree]) -> Callable[Arguments, Tree]:
+    """`function`, traced so that its products of matrices are of full precision.
+
+    By default NVIDIA's matrix units keep 10 bits of every float32 factor: too few for physics and for curvature. A CPU
+    computes the same bits either way.
+    """
+
+    @functools.wraps(function)
+    def traced(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Tree:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return traced
 
 
 def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tree, *args: PyTree) -> Tree:

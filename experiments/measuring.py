@@ -19,6 +19,7 @@ from ccil_jax.config import PRESETS, Config
 from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.methods import METHODS
 from ccil_jax.types import Batch
+from envs.base import full_precision
 
 Work = Callable[[], int]  # does a fixed amount of work, waits for it, and returns how many units it was
 
@@ -185,7 +186,9 @@ def rollout_work(config: Config, env: Any, setting: Setting) -> Work:
 def spread(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
     """A function of one seed as one of all, [S]-leading, on as many devices as training uses."""
     mesh, spec = program.run_mesh(num_seeds), jax.P("runs")
-    return jax.jit(jax.shard_map(jax.vmap(function), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))
+    return jax.jit(
+        jax.shard_map(full_precision(jax.vmap(function)), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    )
 
 
 def noise(env: Any, setting: Setting) -> Demonstrations:

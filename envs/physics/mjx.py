@@ -15,11 +15,15 @@ import mujoco
 from flax import struct
 from jax.typing import ArrayLike
 
+from envs.base import full_precision
 from envs.physics.base import Data, Mocap
-from envs.physics.mjx_patch import align_plane_capsule_frames
+from envs.physics.mjx_patch import align_plane_capsule_frames, searches_that_end
 
-# MJX-Warp allots contacts for all simulations together: 32 each for 8,192.
-_WARP_MAX_CONTACTS = 32 * 8192
+# What MJX-Warp allots, beyond which it drops contacts and says so: contacts of all simulations together (16 each for
+# 65,536; every step copies them, so fewer on a CPU, where it is for tests), and rows of constraints of each.
+_WARP_CONTACTS = {"cpu": 2**13}
+_WARP_CONTACTS_ELSEWHERE = 2**20
+_WARP_ROWS = 512
 
 
 @struct.dataclass(kw_only=True)
@@ -71,10 +75,14 @@ class MjxPhysics:
             raise ValueError("physics 'warp' computes no contact forces: pass contact_cost=False")
         self._mjx = mjx = import_mjx()
         align_plane_capsule_frames()
+        if impl == "warp":
+            from envs.physics import warp_patch
+
+            warp_patch.align_plane_capsule_frames()
         if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
             model = copy.copy(model)
             model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-        limits = {"naconmax": _WARP_MAX_CONTACTS} if impl == "warp" else {}
+        limits = _warp_limits(mjx.make_data(model, impl="jax")) if impl == "warp" else {}
         self._model = mjx.put_model(model, impl=impl)
         # Strongly typed: MJX's `time` is a weak float, which would make every scan over it trace twice.
         self._template = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), mjx.make_data(model, impl=impl, **limits))
@@ -84,6 +92,8 @@ class MjxPhysics:
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in ("qpos", "qvel")))
         self._forces = "cfrc_ext" in fields
 
+    @full_precision
+    @searches_that_end()
     def init(self, qpos: ArrayLike, qvel: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.init`."""
         template = self._template if mocap is None else _place(self._template, mocap.pos, mocap.quat)
@@ -91,9 +101,12 @@ class MjxPhysics:
             qpos=jnp.asarray(qpos, template.qpos.dtype), qvel=jnp.asarray(qvel, template.qvel.dtype)
         )
         if self._derived:
-            data = self._mjx.forward(self._model, data)
+            # Warp's own normalises the quaternions in `qpos`; C MuJoCo leaves them.
+            data = self._mjx.forward(self._model, data).replace(qpos=data.qpos)
         return self._pack(data, {n: jnp.zeros_like(read(data, n)) for n in self._track})
 
+    @full_precision
+    @searches_that_end()
     def step(self, data: Data, ctrl: ArrayLike, mocap: Mocap | None = None) -> Data:
         """See `Physics.step`."""
         carry = data.backend
@@ -131,6 +144,12 @@ class MjxPhysics:
             change=change,
             backend=_Carry(qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart, tracked=tracked),
         )
+
+
+def _warp_limits(data: Any) -> dict[str, int]:
+    """Arguments of `mjx.make_data`, from the one whose arrays have room for whatever the model can do."""
+    contacts = _WARP_CONTACTS.get(jax.default_backend(), _WARP_CONTACTS_ELSEWHERE)
+    return {"naconmax": contacts, "njmax": min(data._impl.efc_J.shape[0], _WARP_ROWS)}
 
 
 def _place(data: Any, pos: jax.Array, quat: jax.Array | None = None) -> Any:

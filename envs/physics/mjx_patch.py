@@ -1,14 +1,23 @@
-"""A correction to MJX 3.17: the friction frame of plane-capsule contacts.
+"""Two changes to MJX 3.17: the friction frame of plane-capsule contacts, and line searches that end.
 
 C MuJoCo aligns a contact's first tangent with the capsule's axis. MJX does so only where the axis's component in the
 plane exceeds 0.5 and takes the world's y axis elsewhere. The pyramidal friction cone is not isotropic, so steep legs
 slide differently: Ant's velocity error against C over one step has a 90 % quantile of 5e-2, and 1e-14 once corrected.
+
+The solver's line search is a scan over all the turns that the model allows (50), so that reverse-mode derivatives pass
+through it; those after its end change nothing. Around it, in the models here, is a while loop that lets none pass. So
+here it is a while loop too, of the few turns that some simulation needs: the same bits.
 """
 
+import contextlib
+import contextvars
 import importlib
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 _MIN_NORM = 1e-9  # of the axis's part in the plane: below it there is no direction to align with
 
@@ -33,6 +42,52 @@ def align_plane_capsule_frames() -> None:
     plane_capsule = primitive.collider(ncon=2)(_plane_capsule)
     plane_capsule.aligned = True
     driver._COLLISION_FUNC[pair] = plane_capsule
+
+
+_searches_end = contextvars.ContextVar("_searches_end", default=False)
+
+
+@contextlib.contextmanager
+def searches_that_end() -> Iterator[None]:
+    """While this is entered, what is traced of MJX has line searches that stop once all simulations' have ended.
+
+    Elsewhere MJX is as it was, also for other code of this process.
+
+    Raises:
+        RuntimeError: MJX's line search is not the one that this was written for.
+    """
+    solver: Any = importlib.import_module("mujoco.mjx._src.solver")
+    original = getattr(solver, "_while_loop_scan", None)
+    if original is None:
+        raise RuntimeError("mujoco-mjx has another line search than version 3.17: review envs/physics/mjx_patch")
+    if not getattr(original, "may_end", False):
+
+        def loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
+            return (_loop if _searches_end.get() else original)(condition, body, start, length)
+
+        loop.may_end = True  # type: ignore[attr-defined]
+        solver._while_loop_scan = loop
+    token = _searches_end.set(True)
+    try:
+        yield
+    finally:
+        _searches_end.reset(token)
+
+
+def _loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
+    """The last value of a search of at most `length` turns, which its condition counts as well."""
+    import os
+
+    turns = int(os.environ.get("TURNS", "4"))
+    packed, unpack = ravel_pytree(start)
+
+    def turn(packed: jax.Array) -> jax.Array:
+        for _ in range(turns):
+            value = unpack(packed)
+            packed = jnp.where(condition(value), ravel_pytree(body(value))[0], packed)
+        return packed
+
+    return unpack(jax.lax.while_loop(lambda packed: condition(unpack(packed)), turn, packed))
 
 
 def _plane_capsule(plane: Any, capsule: Any) -> tuple[Any, Any, Any]:

@@ -1,0 +1,43 @@
+"""The same correction as in `mjx_patch.py`, of the friction frames of plane-capsule contacts, in MJX-Warp."""
+
+import importlib
+from typing import Any
+
+import warp as wp
+
+_WARP = "mujoco.mjx.third_party.mujoco_warp._src"
+_core: Any = importlib.import_module(f"{_WARP}.collision_primitive_core")
+_plane_capsule = _core.plane_capsule
+
+
+def align_plane_capsule_frames() -> None:
+    """Puts `_aligned` where MJX-Warp's kernels find their plane-capsule routine. Idempotent.
+
+    Warp compiles kernels at their first launch, so it must be called before any. Each capsule of this process is
+    affected, also in other code.
+
+    Raises:
+        RuntimeError: MJX-Warp is not the one that this correction was written for.
+    """
+    primitive: Any = importlib.import_module(f"{_WARP}.collision_primitive")
+    if getattr(primitive, "plane_capsule", None) not in (_plane_capsule, _aligned):
+        raise RuntimeError(
+            "MJX-Warp has another plane-capsule routine than mujoco-mjx 3.17: review envs/physics/warp_patch"
+        )
+    primitive.plane_capsule = _aligned
+
+
+@wp.func
+def _aligned(
+    normal: wp.vec3, plane_pos: wp.vec3, capsule_pos: wp.vec3, axis: wp.vec3, radius: float, half_length: float
+):  # type: ignore[no-untyped-def]  # Warp infers what its functions return
+    dist, pos, frame = _plane_capsule(normal, plane_pos, capsule_pos, axis, radius, half_length)
+    tangent = axis - normal * wp.dot(normal, axis)
+    norm = wp.length(tangent)
+    if norm > 1.0e-9:
+        tangent = tangent / norm
+        third = wp.cross(normal, tangent)
+        frame = wp.mat33(
+            normal[0], normal[1], normal[2], tangent[0], tangent[1], tangent[2], third[0], third[1], third[2]
+        )
+    return dist, pos, frame
