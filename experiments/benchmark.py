@@ -10,7 +10,9 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ from envs.registry import PHYSICS
 from experiments import command_line, devices, options, peers, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.summary import show
+
+_LEAST_STEPS = 16  # of each simulation in a batch
 
 
 def make_parser() -> Parser:
@@ -39,13 +43,23 @@ def make_parser() -> Parser:
         help="per seed; one row for each (default: 16)",
     )
     parser.add_argument("--method", default="malm", choices=METHOD_NAMES, help="what is trained (default: malm)")
-    parser.add_argument("--physics", default="auto", choices=PHYSICS, help="engine (default: auto)")
+    parser.add_argument(
+        "--physics", nargs="+", default=["auto"], choices=PHYSICS, help="engines; one row for each (default: auto)"
+    )
     parser.add_argument("--preset", default="paper", choices=tuple(PRESETS), help="hyperparameters (default: paper)")
     parser.add_argument(
         "--batch-size",
         type=positive,
         metavar="K",
-        help="steps per batch, where an engine is slow (default: the preset's, or the next multiple of N)",
+        help="steps per batch (default: the preset's, or the next multiple of N; from 16 steps of each simulation on, "
+        "with larger minibatches, as many as the preset's)",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=positive,
+        default=1,
+        metavar="J",
+        help="rows that are compiled side by side; they are measured one at a time (default: 1)",
     )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter measurements, for a first look")
     parser.add_argument("--seed", default=0, type=command_line.natural, metavar="N", help="base seed (default: 0)")
@@ -67,14 +81,13 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     """One setting (see `measuring.Setting`) per row. Raises `UsageError` or `ConfigError` for wrong input."""
     changes = {}
     for num_envs in arguments.num_envs:
-        batch_size = arguments.batch_size or _batch_size(arguments.preset, num_envs)
-        changes[num_envs] = {"batch_size": batch_size}
-        chosen = {"method": arguments.method, "num_envs": num_envs, "cost_limit": 0.0, "batch_size": batch_size}
+        changes[num_envs] = _batch(arguments.preset, num_envs, arguments.batch_size)
+        chosen = {"method": arguments.method, "num_envs": num_envs, "cost_limit": 0.0, **changes[num_envs]}
         options.config_from(chosen, arguments.preset)
     return [
         {
             "task": options.find_task(task, "--tasks").name,
-            "physics": arguments.physics,
+            "physics": physics,
             "method": arguments.method,
             "num_seeds": num_seeds,
             "num_envs": num_envs,
@@ -85,15 +98,21 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
             "changes": changes[num_envs],
         }
         for task in arguments.tasks
+        for physics in arguments.physics
         for num_seeds in arguments.num_seeds
         for num_envs in arguments.num_envs
     ]
 
 
-def _batch_size(preset: str, num_envs: int) -> int:
-    """The preset's, or the next that `num_envs` simulations can fill."""
-    wanted = PRESETS[preset].get("batch_size", Config().batch_size)
-    return math.ceil(wanted / num_envs) * num_envs
+def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]:
+    """Changes to the preset, so that `num_envs` simulations fill its batch or, where they are many, a larger one."""
+    config = Config(**PRESETS[preset])
+    if batch_size is None:
+        least = max(config.batch_size, _LEAST_STEPS * num_envs)
+        batch_size = math.ceil(least / num_envs) * num_envs
+    times = max(1, batch_size // config.batch_size)
+    minibatches = ("critic_minibatch_size", "discriminator_minibatch_size")
+    return {"batch_size": batch_size} | {name: times * getattr(config, name) for name in minibatches}
 
 
 def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
@@ -102,6 +121,8 @@ def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: 
     path = os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     # The compilation is measured, so nothing may come from a cache.
     environment = {**os.environ, "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    if setting.get("turns"):  # an accelerator's memory is shared
+        environment.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
@@ -129,7 +150,7 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
     table = Table(title="control steps per second, all seeds together", title_justify="left")
     for title in ("task", "seeds x envs", "physics alone", "rollout", "training"):
         table.add_column(title, justify="left" if title == "task" else "right", no_wrap=True)
-    for title in ("training / physics", "meta-gradient / policy step", "compile, s", "peak, MiB"):
+    for title in ("training / physics", "training / rollout", "meta-gradient / policy step", "compile, s", "peak, MiB"):
         table.add_column(title, justify="right")
     for row in rows:
         rates = [row[f"{name}_steps_per_second"] for name in ("physics", "rollout", "training")]
@@ -138,6 +159,7 @@ def print_rows(rows: Sequence[dict[str, Any]]) -> None:
             f"{row['num_seeds']} x {row['num_envs']}",
             *(f"{rate:,.0f}" for rate in rates),
             f"{row['training_to_physics']:.2f}",
+            f"{row['training_to_rollout']:.2f}",
             f"{row['meta_gradient_to_policy_step']:.2f}",
             f"{row['compile_seconds']:.1f}",
             f"{row['peak_memory']:,.0f}",
@@ -199,6 +221,8 @@ def run(arguments: argparse.Namespace) -> None:
             print(json.dumps(measuring.measure(measuring.Setting(**setting))))
         return
     settings = settings_of(arguments)
+    if arguments.jobs > 1 and (arguments.profile or arguments.peers):
+        raise UsageError("--jobs: neither --profile nor --peers takes turns; leave it out")
     pythons = peers.find_pythons(arguments.peers) if arguments.peers else None
     command_line.check_writable(arguments.out.parent, "--out")
     facts = facts_of_machine()
@@ -209,16 +233,39 @@ def run(arguments: argparse.Namespace) -> None:
         run_folder.write_json(arguments.out, {**facts, "rows": rows, "peers": compared})
         print_peers(compared)
         settings = []
-    for setting in settings:
+    failures = []
+    for row in _measured(settings, arguments.jobs, ["--profile"] if arguments.profile else []):
+        if isinstance(row, UsageError):
+            print(row, file=sys.stderr, flush=True)
+            failures.append(str(row))
+            continue
+        rows.append(row)
+        run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
+    if rows and arguments.profile:
+        print_profiles(rows)
+    elif rows:
+        print_rows(rows)
+    if failures:
+        raise UsageError("\n".join(failures))
+    print(f"written to {arguments.out}")
+
+
+def _measured(
+    settings: Sequence[dict[str, Any]], jobs: int, options: Sequence[str]
+) -> Iterator[dict[str, Any] | UsageError]:
+    """Each setting's row, or why it has none; `jobs` of them compile side by side."""
+
+    def measure(setting: dict[str, Any]) -> dict[str, Any] | UsageError:
         size = f"{setting['num_seeds']} x {setting['num_envs']}"
         print(f"measuring {setting['task']}, {size} ...", file=sys.stderr, flush=True)
-        rows.append(measure_row(setting, "benchmark", *(["--profile"] if arguments.profile else [])))
-        run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
-    if arguments.profile:
-        print_profiles(rows)
-    else:
-        print_rows(rows)
-    print(f"written to {arguments.out}")
+        try:
+            return measure_row(setting, "benchmark", *options)
+        except UsageError as error:
+            return error
+
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
+        turns = {"turns": str(Path(folder) / "turns")} if jobs > 1 else {}
+        yield from pool.map(measure, [{**setting, **turns} for setting in settings])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

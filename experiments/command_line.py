@@ -65,6 +65,7 @@ def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None]
     """Parses and runs; wrong input found later than parsing ends in the same one line and exit status 2."""
     arguments = parser.parse_args(argv)
     devices.widen_vectors()
+    devices.tune_gpus()
     devices.keep_programs()
     try:
         return run(arguments) or 0

@@ -51,6 +51,20 @@ def widen_vectors() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_prefer_vector_width=512".strip()
 
 
+def tune_gpus() -> None:
+    """Has XLA capture loops in CUDA graphs, and not try out kernels for each product of matrices while it compiles.
+
+    Physics and learning are loops of many small kernels, whose launches take longer than they do. The user's own
+    --xla_gpu_enable_command_buffer and --xla_gpu_enable_triton_gemm in XLA_FLAGS have precedence. A CPU takes no
+    notice. Call it before JAX is used.
+    """
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    for name, value in (("xla_gpu_enable_command_buffer", "+WHILE"), ("xla_gpu_enable_triton_gemm", "false")):
+        if not any(flag.startswith(f"--{name}") for flag in flags):
+            flags.append(f"--{name}={value}")
+    os.environ["XLA_FLAGS"] = " ".join(flags)
+
+
 def keep_programs() -> None:
     """Has JAX keep compiled programs in the user's cache folder, so that the second start of one compiles nothing.
 

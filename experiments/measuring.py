@@ -5,6 +5,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,6 +21,10 @@ from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.methods import METHODS
 from ccil_jax.types import Batch
 from envs.base import full_precision
+from experiments.turns import turn
+
+_MOST_SIMS = 1024  # of C MuJoCo, stepped for comparison
+_LONG = 1_000_000  # environment steps
 
 Work = Callable[[], int]  # does a fixed amount of work, waits for it, and returns how many units it was
 
@@ -39,6 +44,7 @@ class Setting:
     seed: int
     changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to the preset: fields of `Config`
     num_demonstration_steps: int = 10_000
+    turns: str | None = None  # a file: what is measured beside others waits until none of them compiles or measures
 
 
 def measure_training(setting: Setting) -> dict[str, Any]:
@@ -61,11 +67,12 @@ def measure_training(setting: Setting) -> dict[str, Any]:
 
 
 def make_config(setting: Setting) -> Config:
-    """Of the training that is measured: two iterations, which make a chunk."""
+    """Of the training that is measured: two iterations, which make a chunk, or a single long one."""
     changes = {name: tuple(value) if isinstance(value, list) else value for name, value in setting.changes.items()}
     chosen = {"method": setting.method, "num_envs": setting.num_envs}
     config = Config(**{**PRESETS[setting.preset], **changes, **chosen})
-    return config.replace(env_steps=2 * config.steps_per_iteration)
+    num_iterations = 2 if setting.num_seeds * config.steps_per_iteration < _LONG else 1
+    return config.replace(env_steps=num_iterations * config.steps_per_iteration)
 
 
 def measure(setting: Setting) -> dict[str, Any]:
@@ -75,23 +82,26 @@ def measure(setting: Setting) -> dict[str, Any]:
     `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does under random
     controls: the ceiling of the native backend.
     """
-    env: Any = envs.make(setting.task, physics=setting.physics)
-    config = make_config(setting)
-    training, compile_seconds = training_work(config, env, setting)
-    plain, meta = _policy_steps(config, env, setting)
-    works = {
-        "physics": physics_work(env, setting),
-        "rollout": rollout_work(config, env, setting),
-        "training": training,
-        "plain": plain,
-        "meta": meta,
-    }
+    turns = Path(setting.turns) if setting.turns else None
+    with turn(turns, alone=False):
+        env: Any = envs.make(setting.task, physics=setting.physics)
+        config = make_config(setting)
+        training, compile_seconds = training_work(config, env, setting)
+        plain, meta = _policy_steps(config, env, setting)
+        works = {
+            "physics": physics_work(env, setting),
+            "rollout": rollout_work(config, env, setting),
+            "training": training,
+            "plain": plain,
+            "meta": meta,
+        }
+        for work in works.values():
+            work()  # compiles, and warms caches
     rates: dict[str, list[float]] = {name: [] for name in works}
-    for work in works.values():
-        work()  # compiles, and warms caches
-    for _ in range(setting.rounds):
-        for name, work in works.items():
-            rates[name].append(rate_of(work, setting.seconds))
+    with turn(turns, alone=True):
+        for _ in range(setting.rounds):
+            for name, work in works.items():
+                rates[name].append(rate_of(work, setting.seconds))
     median = {name: float(np.median(values)) for name, values in rates.items()}
     return {
         "task": setting.task,
@@ -134,10 +144,13 @@ def _peak_memory() -> float:
 
 
 def physics_work(env: Any, setting: Setting) -> Work:
-    """The engine alone, from states after a reset: no JAX, no observations, rewards or further resets."""
+    """The engine alone, from states after a reset: no JAX, no observations, rewards or further resets.
+
+    Of many simulations only some: its rate does not grow any more, but each takes memory.
+    """
     from envs.physics.native import usable_cpus
 
-    num_sims, num_steps = setting.num_seeds * setting.num_envs, 100
+    num_sims, num_steps = min(setting.num_seeds * setting.num_envs, _MOST_SIMS), 100
     engine = RawBatch(env.model, num_sims, min(usable_cpus(), num_sims))
     before = mujoco.mjtState.mjSTATE_PHYSICS | mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_WARMSTART
     start = mujoco.mj_stateSize(env.model, int(before))

@@ -1,5 +1,6 @@
 """Interchangeable physics: one pure `step`, several engines. `make_physics` chooses."""
 
+import importlib.util
 from collections.abc import Sequence
 
 import jax
@@ -11,10 +12,17 @@ __all__ = ["Data", "Mocap", "Physics", "make_physics", "resolve"]
 
 
 def resolve(name: str) -> str:
-    """What "auto" stands for: "native" where JAX's default backend is the CPU, "mjx" elsewhere. Other names pass."""
+    """What "auto" stands for; other names pass.
+
+    "native" where JAX's default device is a CPU, "warp" where it is NVIDIA's and `mujoco-mjx[warp]` is installed, "mjx"
+    elsewhere.
+    """
     if name != "auto":
         return name
-    return "native" if jax.default_backend() == "cpu" else "mjx"
+    if jax.default_backend() == "cpu":
+        return "native"
+    nvidia = jax.devices()[0].device_kind.startswith("NVIDIA")
+    return "warp" if nvidia and importlib.util.find_spec("warp") else "mjx"
 
 
 def make_physics(

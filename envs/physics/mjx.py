@@ -47,8 +47,8 @@ class MjxPhysics:
     Args:
         model: any model that MJX loads.
         num_substeps: engine steps per control step.
-        fields: derived `MjData` arrays for `Data.fields`; "cfrc_ext" only with impl "jax". If there are any, or
-            derived arrays in `track`, `init` runs the forward pass.
+        fields: derived `MjData` arrays for `Data.fields`. If there are any, or derived arrays in `track`, `init` runs
+            the forward pass.
         track: `MjData` arrays for `Data.change`; in float32 unless x64 is enabled.
         refresh: whether a control step ends with a forward pass.
         impl: "jax" or "warp". Warp is not bit-deterministic.
@@ -71,8 +71,6 @@ class MjxPhysics:
         self.name = "mjx" if impl == "jax" else impl
         if impl == "warp" and importlib.util.find_spec("warp") is None:
             raise ImportError("physics 'warp' needs the package warp: pip install 'mujoco-mjx[warp]'")
-        if impl == "warp" and "cfrc_ext" in fields:
-            raise ValueError("physics 'warp' computes no contact forces: pass contact_cost=False")
         self._mjx = mjx = import_mjx()
         align_plane_capsule_frames()
         if impl == "warp":
@@ -83,14 +81,16 @@ class MjxPhysics:
             model = copy.copy(model)
             model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         limits = _warp_limits(mjx.make_data(model, impl="jax")) if impl == "warp" else {}
+        self._forces = "cfrc_ext" in fields
         self._model = mjx.put_model(model, impl=impl)
+        if impl == "warp":  # which computes contact forces in every forward pass, or never
+            self._model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": self._forces})
         # Strongly typed: MJX's `time` is a weak float, which would make every scan over it trace twice.
         self._template = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), mjx.make_data(model, impl=impl, **limits))
         self._num_substeps = num_substeps
         self._refresh = refresh
         self._fields, self._track = tuple(fields), tuple(track)
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in ("qpos", "qvel")))
-        self._forces = "cfrc_ext" in fields
 
     @full_precision
     @searches_that_end()
@@ -131,7 +131,7 @@ class MjxPhysics:
         state, _ = jax.lax.scan(substep, state, path, length=self._num_substeps)
         if self._refresh:
             state = self._mjx.forward(self._model, state)
-        if self._forces:
+        if self._forces and self.name == "mjx":
             state = self._mjx.rne_postconstraint(self._model, state)
         return self._pack(state, {n: read(state, n) - before[n] for n in self._track})
 

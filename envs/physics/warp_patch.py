@@ -27,10 +27,10 @@ def align_plane_capsule_frames() -> None:
     primitive.plane_capsule = _aligned
 
 
-@wp.func
-def _aligned(
+@wp.func  # type: ignore[untyped-decorator]
+def _aligned(  # type: ignore[no-untyped-def]  # Warp infers what its functions return
     normal: wp.vec3, plane_pos: wp.vec3, capsule_pos: wp.vec3, axis: wp.vec3, radius: float, half_length: float
-):  # type: ignore[no-untyped-def]  # Warp infers what its functions return
+):
     dist, pos, frame = _plane_capsule(normal, plane_pos, capsule_pos, axis, radius, half_length)
     tangent = axis - normal * wp.dot(normal, axis)
     norm = wp.length(tangent)
