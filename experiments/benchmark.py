@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -233,27 +233,27 @@ def run(arguments: argparse.Namespace) -> None:
         run_folder.write_json(arguments.out, {**facts, "rows": rows, "peers": compared})
         print_peers(compared)
         settings = []
-    failures = []
-    for row in _measured(settings, arguments.jobs, ["--profile"] if arguments.profile else []):
+    failures, measured = [], {}
+    for index, row in _measured(settings, arguments.jobs, ["--profile"] if arguments.profile else []):
         if isinstance(row, UsageError):
-            print(row, file=sys.stderr, flush=True)
             failures.append(str(row))
             continue
-        rows.append(row)
+        measured[index] = row
+        rows = [measured[i] for i in sorted(measured)]
         run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
     if rows and arguments.profile:
         print_profiles(rows)
     elif rows:
         print_rows(rows)
     if failures:
-        raise UsageError("\n".join(failures))
+        raise UsageError("; ".join(failures))
     print(f"written to {arguments.out}")
 
 
 def _measured(
     settings: Sequence[dict[str, Any]], jobs: int, options: Sequence[str]
-) -> Iterator[dict[str, Any] | UsageError]:
-    """Each setting's row, or why it has none; `jobs` of them compile side by side."""
+) -> Iterator[tuple[int, dict[str, Any] | UsageError]]:
+    """Each setting's index and row, or why it has none, as they come; `jobs` of them compile side by side."""
 
     def measure(setting: dict[str, Any]) -> dict[str, Any] | UsageError:
         size = f"{setting['num_seeds']} x {setting['num_envs']}"
@@ -265,7 +265,9 @@ def _measured(
 
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
         turns = {"turns": str(Path(folder) / "turns")} if jobs > 1 else {}
-        yield from pool.map(measure, [{**setting, **turns} for setting in settings])
+        coming = {pool.submit(measure, {**setting, **turns}): i for i, setting in enumerate(settings)}
+        for row in as_completed(coming):
+            yield coming[row], row.result()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,8 @@
 
 import json
 import sys
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ import pytest
 from experiments import benchmark, growth, peers
 from experiments.command_line import UsageError
 from experiments.peers import Peer
+from experiments.turns import turn
 
 SCRIPT = """
 import json, pathlib, sys
@@ -54,7 +57,63 @@ def test_rows_are_all_sizes_of_all_tasks() -> None:
     assert [(s["task"], s["num_seeds"], s["num_envs"]) for s in settings] == [
         (task, seeds, envs) for task in ("Swimmer", "Ant") for seeds in (1, 32) for envs in (16, 4096)
     ]
-    assert {s["num_envs"]: s["changes"]["batch_size"] for s in settings} == {16: 2000, 4096: 4096}
+    # Many simulations fill a larger batch, in as many minibatches: here 32 times the preset's 2000 in 128s.
+    small = {"batch_size": 2000, "critic_minibatch_size": 128, "discriminator_minibatch_size": 128}
+    large = {"batch_size": 65536, "critic_minibatch_size": 4096, "discriminator_minibatch_size": 4096}
+    assert {s["num_envs"]: s["changes"] for s in settings} == {16: small, 4096: large}
+
+
+def test_batches_of_any_number_of_simulations_are_whole_steps_of_each() -> None:
+    for num_envs in (1, 16, 24, 125, 126, 1024, 3000):
+        changes = benchmark._batch("paper", num_envs, None)
+        assert changes["batch_size"] % num_envs == 0
+        assert changes["batch_size"] >= max(2000, 16 * num_envs)
+    assert benchmark._batch("paper", 16, 192)["batch_size"] == 192
+
+
+def test_rows_that_fail_do_not_spoil_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, turns = tmp_path / "benchmark.json", set()
+
+    def measure_row(setting: dict[str, Any], launcher: str, *options: str) -> dict[str, Any]:
+        turns.add(setting["turns"])
+        if setting["num_envs"] == 32:
+            raise UsageError("--num-envs 32: cannot be measured: out of memory")
+        if setting["num_envs"] == 16:  # the first to be asked for is the last to come: nothing waits for it
+            while not (out.is_file() and len(json.loads(out.read_text())["rows"]) == 1):
+                time.sleep(0.01)
+        return {"num_envs": setting["num_envs"]}
+
+    monkeypatch.setattr(benchmark, "measure_row", measure_row)
+    monkeypatch.setattr(benchmark, "print_rows", lambda rows: print([row["num_envs"] for row in rows]))
+    sizes = ["--num-seeds", "1", "--num-envs", "16", "32", "64"]
+    with pytest.raises(SystemExit) as end:
+        benchmark.main(["--tasks", "Swimmer", *sizes, "--jobs", "3", "--out", str(out)])
+    assert end.value.code == 2
+    said = capsys.readouterr()
+    assert said.out.strip() == "[16, 64]"
+    assert "out of memory" in said.err
+    assert [row["num_envs"] for row in json.loads(out.read_text())["rows"]] == [16, 64]
+    assert len(turns) == 1
+
+
+def test_who_measures_is_alone(tmp_path: Path) -> None:
+    file = tmp_path / "turns"
+    wait = threading.Event()
+
+    def measure() -> None:
+        with turn(file, alone=True):
+            wait.set()
+
+    with turn(file, alone=False), turn(file, alone=False):  # they compile side by side
+        thread = threading.Thread(target=measure)
+        thread.start()
+        assert not wait.wait(0.3)
+    thread.join(5)
+    assert wait.is_set()
+    with turn(None, alone=True), turn(None, alone=True):
+        pass
 
 
 def test_missing_environments_of_peers_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

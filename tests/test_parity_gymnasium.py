@@ -149,17 +149,24 @@ def test_native_trajectory_is_gymnasiums_to_the_last_bit(name: str) -> None:
     assert int(state.step_count) == 200
 
 
+QUICK = {("HalfCheetah", "mjx"), ("Ant", "warp")}  # to compile; Ant has contact forces and legs of all directions
+
+
 @pytest.mark.parametrize(
-    "name",
-    [name if name == "HalfCheetah" else pytest.param(name, marks=pytest.mark.slow) for name in LOCOMOTION],
+    ("name", "physics"),
+    [
+        pytest.param(name, physics, marks=() if (name, physics) in QUICK else pytest.mark.slow)
+        for name in LOCOMOTION
+        for physics in ("mjx", "warp")
+    ],
 )
-def test_mjx_step_equals_gymnasium(name: str) -> None:
+def test_step_on_an_accelerators_engine_equals_gymnasium(name: str, physics: str) -> None:
     """1e-3 in float32, contacts included; the velocities of Ant's feet set it (8e-4 worst), the median is below 1e-5.
 
-    Looser than native because the solver iterates in float32; in float64 the same comparison gives 1e-13.
+    Looser than native because the solver iterates in float32; in float64 the same comparison gives 1e-13 on mjx.
     """
     expected = reference(name)
-    env: Any = envs.make(name, physics="mjx")
+    env: Any = envs.make(name, physics=physics)
     state = one_step(env, expected)
     error = np.abs(state.obs - expected["obs"]) / np.maximum(1.0, np.abs(expected["obs"]))
     assert error.max() < 1e-3

@@ -248,10 +248,11 @@ MJX_BOUNDS = {
 }
 
 
-@pytest.mark.slow  # 2 to 4 minutes of compilation each
+@pytest.mark.slow  # mjx: 2 to 4 minutes of compilation each
+@pytest.mark.parametrize("physics", ["mjx", "warp"])
 @pytest.mark.parametrize("recording", MJX_BOUNDS, indirect=True)
-def test_one_control_step_on_mjx(recording: Recording) -> None:
-    env = SafetyGym(recording.env.name, physics="mjx")
+def test_one_control_step_on_an_accelerators_engine(recording: Recording, physics: str) -> None:
+    env = SafetyGym(recording.env.name, physics=physics)
     chosen = np.flatnonzero(without_contacts(recording.data))[:128]
     quantiles = np.quantile(errors_of_steps(recording, env, chosen), [0.5, 0.9])
     assert (quantiles <= MJX_BOUNDS[env.name]).all(), quantiles

@@ -1,8 +1,10 @@
 """The physics backends: bits, purity, vmapping, divergence, and MJX against C MuJoCo."""
 
+import importlib.util
 import os
 import subprocess
 import sys
+import types
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,10 +15,12 @@ import mujoco
 import numpy as np
 import pytest
 
-import envs
+from envs.base import full_precision
 from envs.locomotion import load_model
-from envs.physics import foreign, make_physics
+from envs.physics import foreign, make_physics, resolve
 from envs.physics.bits import float64_bits
+from envs.physics.mjx import import_mjx
+from envs.physics.mjx_patch import searches_that_end
 from envs.physics.native import NativePhysics
 
 SUBNORMAL = [1e-38, 1e-45, -1e-45, 1.1754942e-38, 2e-39]  # in float32
@@ -285,6 +289,65 @@ def test_mjx_step_is_differentiable() -> None:
     assert gradient[0] != 0.0
 
 
+BOUNCE = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <geom type="plane" size="5 5 1"/>
+    <body pos="0 0 0.3">
+      <freejoint/>
+      <geom type="capsule" size="0.1 0.2" zaxis="0.5 0 1"/>
+      <body pos="0.3 0 0">
+        <joint name="hinge" axis="0 1 0" range="-30 30" limited="true"/>
+        <geom type="capsule" size="0.05 0.2" zaxis="1 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="hinge"/></actuator>
+</mujoco>
+"""
+
+
+def test_line_searches_that_end_compute_the_same_bits() -> None:
+    """Against MJX's own, which take all the turns allowed: eight capsules fall, slide and bend to a hinge's limit."""
+    mjx, model = import_mjx(), mujoco.MjModel.from_xml_string(BOUNCE)
+    device_model, data = mjx.put_model(model), mjx.make_data(model)
+
+    def run(qpos: jax.Array) -> jax.Array:
+        def step(data: Any, _: None) -> tuple[Any, jax.Array]:
+            new = mjx.step(device_model, data)
+            return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), new, data), new.qvel
+
+        return jax.lax.scan(step, jax.tree.map(jnp.asarray, data.replace(qpos=qpos, ctrl=jnp.ones(1))), None, 60)[1]
+
+    starts = np.zeros((8, 8), np.float32)
+    starts[:, 2], starts[:, 3], starts[:, 7] = np.linspace(0.1, 0.5, 8), 1.0, np.linspace(-0.4, 0.4, 8)
+    with searches_that_end():
+        ending = str(jax.make_jaxpr(lambda qpos: run(qpos))(starts[0]))
+        speeds = np.asarray(jax.jit(jax.vmap(lambda qpos: run(qpos)))(starts))
+    full = str(jax.make_jaxpr(run)(starts[0]))  # other code's MJX is as it was
+    wanted = np.asarray(jax.jit(jax.vmap(run))(starts))
+    assert np.abs(np.diff(wanted, axis=1)).max() > 0.1, "nothing happens"
+    np.testing.assert_array_equal(speeds.view(np.uint32), wanted.view(np.uint32))
+
+    physics = make_physics("mjx", model, num_substeps=2)
+    ours = str(jax.make_jaxpr(lambda qpos: physics.step(physics.init(qpos, jnp.zeros(7)), jnp.ones(1)))(starts[0]))
+    assert f"length={model.opt.ls_iterations}" in full
+    assert f"length={model.opt.ls_iterations}" not in ending
+    assert f"length={model.opt.ls_iterations}" not in ours
+
+
+def test_products_are_of_full_precision_whatever_the_default() -> None:
+    """A TPU's and an NVIDIA GPU's is not float32's."""
+    x = jnp.ones((2, 2))
+    assert "HIGHEST" not in str(jax.make_jaxpr(jnp.matmul)(x, x))
+    assert "HIGHEST" in str(jax.make_jaxpr(full_precision(jnp.matmul))(x, x))
+    model = mujoco.MjModel.from_xml_string(BOUNCE)
+    physics = make_physics("mjx", model, num_substeps=1)
+    step = str(jax.make_jaxpr(lambda qpos: physics.step(physics.init(qpos, jnp.zeros(7)), jnp.ones(1)))(model.qpos0))
+    assert step.count("dot_general") == step.count("precision=(Precision.HIGHEST") > 10
+
+
 def test_mjx_table_has_the_routine_that_the_correction_replaces() -> None:
     """The correction touches a private table: this fails when an update of MJX moves or replaces the entry."""
     program = (
@@ -332,13 +395,37 @@ def test_unknown_physics_is_refused() -> None:
         make_physics("bullet", mujoco.MjModel.from_xml_string(PENDULUM), num_substeps=1)
 
 
-def test_warp_without_its_package_is_refused() -> None:
-    import importlib.util
+@pytest.mark.parametrize(
+    ("backend", "kind", "installed", "chosen"),
+    [
+        ("cpu", "cpu", True, "native"),
+        ("gpu", "NVIDIA H200", True, "warp"),
+        ("gpu", "NVIDIA H200", False, "mjx"),
+        ("gpu", "AMD Instinct MI300X", True, "mjx"),
+        ("tpu", "TPU v5", True, "mjx"),
+    ],
+)
+def test_auto_is_the_fastest_that_the_machine_can_do(
+    backend: str, kind: str, installed: bool, chosen: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jax, "devices", lambda: [types.SimpleNamespace(device_kind=kind)])
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
+    assert resolve("auto") == chosen
+    assert resolve("mjx") == "mjx"
 
-    if importlib.util.find_spec("warp") is not None:
-        pytest.skip("warp is installed")
+
+def test_warp_has_room_for_all_that_the_tasks_need() -> None:
+    """Rows of constraints for each simulation, contacts for all: beyond them it would drop some."""
+    physics = make_physics("warp", load_model("half_cheetah.xml"), num_substeps=1)
+    assert physics._template._impl.efc__J.shape[0] >= 70
+    assert physics._template._impl.naconmax == 2**15
+
+
+def test_warp_without_its_package_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"mujoco-mjx\[warp\]"):
-        envs.make("Swimmer", physics="warp")
+        make_physics("warp", mujoco.MjModel.from_xml_string(PENDULUM), num_substeps=1)
 
 
 def test_importing_envs_imports_neither_jax_nor_an_engine() -> None:

@@ -205,6 +205,24 @@ def test_vectors_are_as_wide_as_the_processor_has_them_unless_the_user_says_othe
     assert "XLA_FLAGS" not in os.environ
 
 
+def test_gpus_run_loops_as_graphs_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    devices.tune_gpus()
+    devices.tune_gpus()
+    flags = ["--xla_gpu_enable_command_buffer=+WHILE", "--xla_gpu_enable_triton_gemm=false"]
+    assert os.environ["XLA_FLAGS"].split() == flags
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_command_buffer= --xla_cpu_prefer_vector_width=512")
+    devices.tune_gpus()
+    assert os.environ["XLA_FLAGS"].split() == [
+        "--xla_gpu_enable_command_buffer=",
+        "--xla_cpu_prefer_vector_width=512",
+        flags[1],
+    ]
+    # XLA ends the process over a flag that it does not know; on a CPU too.
+    monkeypatch.setenv("XLA_FLAGS", " ".join(flags))
+    subprocess.run([sys.executable, "-c", "import jax; jax.numpy.ones(1).sum()"], check=True, capture_output=True)
+
+
 def test_compiled_programs_are_kept_unless_the_user_says_otherwise(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,7 +21,7 @@ from envs.physics.mjx_patch import align_plane_capsule_frames, searches_that_end
 
 # What MJX-Warp allots, beyond which it drops contacts and says so: contacts of all simulations together (16 each for
 # 65,536; every step copies them, so fewer on a CPU, where it is for tests), and rows of constraints of each.
-_WARP_CONTACTS = {"cpu": 2**13}
+_WARP_CONTACTS = {"cpu": 2**15}
 _WARP_CONTACTS_ELSEWHERE = 2**20
 _WARP_ROWS = 512
 

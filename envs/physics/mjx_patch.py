@@ -20,6 +20,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 _MIN_NORM = 1e-9  # of the axis's part in the plane: below it there is no direction to align with
+_TURNS = 4  # of a line search between two looks at whether it goes on
+
+_searches_end = contextvars.ContextVar("_searches_end", default=False)  # in what is being traced
 
 
 def align_plane_capsule_frames() -> None:
@@ -42,9 +45,6 @@ def align_plane_capsule_frames() -> None:
     plane_capsule = primitive.collider(ncon=2)(_plane_capsule)
     plane_capsule.aligned = True
     driver._COLLISION_FUNC[pair] = plane_capsule
-
-
-_searches_end = contextvars.ContextVar("_searches_end", default=False)
 
 
 @contextlib.contextmanager
@@ -75,14 +75,15 @@ def searches_that_end() -> Iterator[None]:
 
 
 def _loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
-    """The last value of a search of at most `length` turns, which its condition counts as well."""
-    import os
+    """The last value of a search of at most `length` turns, which its condition counts as well.
 
-    turns = int(os.environ.get("TURNS", "4"))
+    On a GPU it is launches that take time. Packed, what is carried is one array to select and copy, not ten; and only
+    after some turns is it asked whether another is needed.
+    """
     packed, unpack = ravel_pytree(start)
 
     def turn(packed: jax.Array) -> jax.Array:
-        for _ in range(turns):
+        for _ in range(_TURNS):
             value = unpack(packed)
             packed = jnp.where(condition(value), ravel_pytree(body(value))[0], packed)
         return packed

@@ -1,4 +1,6 @@
 """The same correction as in `mjx_patch.py`, of the friction frames of plane-capsule contacts, in MJX-Warp."""
+# mypy: ignore-errors
+# (What Warp compiles is Python by its looks only.)
 
 import importlib
 from typing import Any
@@ -27,8 +29,8 @@ def align_plane_capsule_frames() -> None:
     primitive.plane_capsule = _aligned
 
 
-@wp.func  # type: ignore[untyped-decorator]
-def _aligned(  # type: ignore[no-untyped-def]  # Warp infers what its functions return
+@wp.func
+def _aligned(  # Warp infers what its functions return
     normal: wp.vec3, plane_pos: wp.vec3, capsule_pos: wp.vec3, axis: wp.vec3, radius: float, half_length: float
 ):
     dist, pos, frame = _plane_capsule(normal, plane_pos, capsule_pos, axis, radius, half_length)
@@ -36,8 +38,5 @@ def _aligned(  # type: ignore[no-untyped-def]  # Warp infers what its functions 
     norm = wp.length(tangent)
     if norm > 1.0e-9:
         tangent = tangent / norm
-        third = wp.cross(normal, tangent)
-        frame = wp.mat33(
-            normal[0], normal[1], normal[2], tangent[0], tangent[1], tangent[2], third[0], third[1], third[2]
-        )
+        frame = wp.matrix_from_rows(normal, tangent, wp.cross(normal, tangent))
     return dist, pos, frame
