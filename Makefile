@@ -84,6 +84,6 @@ $(VENV)/.run: pyproject.toml | $(VENV)/.made
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/.made
-	@echo "Installing ccil_jax and its checks into $(VENV): about 1 GB, some minutes"
+	@echo "Installing ccil_jax and its checks into $(VENV): about 2 GB, some minutes"
 	@$(RUN) pip install --quiet --disable-pip-version-check --editable ".[dev]"
 	@touch $(VENV)/.run $@
