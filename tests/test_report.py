@@ -199,12 +199,13 @@ def test_benchmark_settings_and_table(capsys: pytest.CaptureFixture[str]) -> Non
         "compile_seconds": 12.0,
         **{f"{name}_steps_per_second": 1e4 for name in ("physics", "rollout", "training")},
         "training_to_physics": 0.5,
+        "training_to_rollout": 0.75,
         "meta_gradient_to_policy_step": 0.1,
         "peak_memory": 900.0,
     }
     benchmark.print_rows([row])
     out = capsys.readouterr().out
-    for text in ("Swimmer (native)", "8 x 16", "10,000", "0.50", "0.10", "12.0", "900"):
+    for text in ("Swimmer (native)", "8 x 16", "10,000", "0.50", "0.75", "0.10", "12.0", "900"):
         assert text in out
 
 
