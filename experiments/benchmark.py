@@ -51,8 +51,8 @@ def make_parser() -> Parser:
         "--batch-size",
         type=positive,
         metavar="K",
-        help="steps per batch (default: the preset's, or the next multiple of N; from 16 steps of each simulation on, "
-        "with larger minibatches, as many as the preset's)",
+        help="steps per batch, whose minibatches grow with it (default: the preset's, or the next multiple of N, or 16 "
+        "steps of each simulation, whichever is more)",
     )
     parser.add_argument(
         "--jobs",

@@ -46,9 +46,8 @@ def widen_vectors() -> None:
     Processors before those with `avx512_bf16` (AMD from Zen 4, Intel from Cooper Lake) slow down for them. The user's
     own --xla_cpu_prefer_vector_width in XLA_FLAGS has precedence. Call it before JAX is used.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
-    if "avx512_bf16" in _processor_features().split() and "--xla_cpu_prefer_vector_width" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_prefer_vector_width=512".strip()
+    if "avx512_bf16" in _processor_features().split():
+        _ask_xla("xla_cpu_prefer_vector_width", "512")
 
 
 def tune_gpus() -> None:
@@ -58,11 +57,15 @@ def tune_gpus() -> None:
     --xla_gpu_enable_command_buffer and --xla_gpu_enable_triton_gemm in XLA_FLAGS have precedence. A CPU takes no
     notice. Call it before JAX is used.
     """
+    _ask_xla("xla_gpu_enable_command_buffer", "+WHILE")
+    _ask_xla("xla_gpu_enable_triton_gemm", "false")
+
+
+def _ask_xla(name: str, value: str) -> None:
+    """Sets a flag of XLA that the user has not set."""
     flags = os.environ.get("XLA_FLAGS", "").split()
-    for name, value in (("xla_gpu_enable_command_buffer", "+WHILE"), ("xla_gpu_enable_triton_gemm", "false")):
-        if not any(flag.startswith(f"--{name}") for flag in flags):
-            flags.append(f"--{name}={value}")
-    os.environ["XLA_FLAGS"] = " ".join(flags)
+    if not any(flag.startswith(f"--{name}") for flag in flags):
+        os.environ["XLA_FLAGS"] = " ".join([*flags, f"--{name}={value}"])
 
 
 def keep_programs() -> None:

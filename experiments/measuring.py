@@ -5,7 +5,6 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -79,11 +78,10 @@ def measure(setting: Setting) -> dict[str, Any]:
     """Measures everything in turn, `rounds` times, and returns medians.
 
     Rates are control steps of all seeds per second; a control step is `num_substeps` engine steps.
-    `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does under random
-    controls: the ceiling of the native backend.
+    `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does (but see
+    `physics_work`) under random controls: the ceiling of the native backend.
     """
-    turns = Path(setting.turns) if setting.turns else None
-    with turn(turns, alone=False):
+    with turn(setting.turns, alone=False):
         env: Any = envs.make(setting.task, physics=setting.physics)
         config = make_config(setting)
         training, compile_seconds = training_work(config, env, setting)
@@ -98,7 +96,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         for work in works.values():
             work()  # compiles, and warms caches
     rates: dict[str, list[float]] = {name: [] for name in works}
-    with turn(turns, alone=True):
+    with turn(setting.turns, alone=True):
         for _ in range(setting.rounds):
             for name, work in works.items():
                 rates[name].append(rate_of(work, setting.seconds))

@@ -99,7 +99,7 @@ def test_rows_that_fail_do_not_spoil_the_others(
 
 
 def test_who_measures_is_alone(tmp_path: Path) -> None:
-    file = tmp_path / "turns"
+    file = str(tmp_path / "turns")
     wait = threading.Event()
 
     def measure() -> None:

@@ -21,8 +21,7 @@ from envs.physics.mjx_patch import align_plane_capsule_frames, searches_that_end
 
 # What MJX-Warp allots, beyond which it drops contacts and says so: contacts of all simulations together (16 each for
 # 65,536; every step copies them, so fewer on a CPU, where it is for tests), and rows of constraints of each.
-_WARP_CONTACTS = {"cpu": 2**15}
-_WARP_CONTACTS_ELSEWHERE = 2**20
+_WARP_CONTACTS_ON_CPU, _WARP_CONTACTS = 2**15, 2**20
 _WARP_ROWS = 512
 
 
@@ -80,11 +79,13 @@ class MjxPhysics:
         if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
             model = copy.copy(model)
             model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-        limits = _warp_limits(mjx.make_data(model, impl="jax")) if impl == "warp" else {}
-        self._forces = "cfrc_ext" in fields
-        self._model = mjx.put_model(model, impl=impl)
-        if impl == "warp":  # which computes contact forces in every forward pass, or never
-            self._model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": self._forces})
+        self._model, limits = mjx.put_model(model, impl=impl), {}
+        forces = "cfrc_ext" in fields
+        if impl == "warp":
+            limits = _warp_limits(mjx.make_data(model, impl="jax"))
+            # Warp computes contact forces in every forward pass, or never.
+            self._model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": forces})
+        self._forces_after_step = forces and impl == "jax"
         # Strongly typed: MJX's `time` is a weak float, which would make every scan over it trace twice.
         self._template = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), mjx.make_data(model, impl=impl, **limits))
         self._num_substeps = num_substeps
@@ -131,7 +132,7 @@ class MjxPhysics:
         state, _ = jax.lax.scan(substep, state, path, length=self._num_substeps)
         if self._refresh:
             state = self._mjx.forward(self._model, state)
-        if self._forces and self.name == "mjx":
+        if self._forces_after_step:
             state = self._mjx.rne_postconstraint(self._model, state)
         return self._pack(state, {n: read(state, n) - before[n] for n in self._track})
 
@@ -148,7 +149,7 @@ class MjxPhysics:
 
 def _warp_limits(data: Any) -> dict[str, int]:
     """Arguments of `mjx.make_data`, from the one whose arrays have room for whatever the model can do."""
-    contacts = _WARP_CONTACTS.get(jax.default_backend(), _WARP_CONTACTS_ELSEWHERE)
+    contacts = _WARP_CONTACTS_ON_CPU if jax.default_backend() == "cpu" else _WARP_CONTACTS
     return {"naconmax": contacts, "njmax": min(data._impl.efc_J.shape[0], _WARP_ROWS)}
 
 

@@ -11,6 +11,7 @@ here it is a while loop too, of the few turns that some simulation needs: the sa
 
 import contextlib
 import contextvars
+import functools
 import importlib
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -56,22 +57,25 @@ def searches_that_end() -> Iterator[None]:
     Raises:
         RuntimeError: MJX's line search is not the one that this was written for.
     """
-    solver: Any = importlib.import_module("mujoco.mjx._src.solver")
-    original = getattr(solver, "_while_loop_scan", None)
-    if original is None:
-        raise RuntimeError("mujoco-mjx has another line search than version 3.17: review envs/physics/mjx_patch")
-    if not getattr(original, "may_end", False):
-
-        def loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
-            return (_loop if _searches_end.get() else original)(condition, body, start, length)
-
-        loop.may_end = True  # type: ignore[attr-defined]
-        solver._while_loop_scan = loop
+    _let_searches_end()
     token = _searches_end.set(True)
     try:
         yield
     finally:
         _searches_end.reset(token)
+
+
+@functools.cache  # once in a process
+def _let_searches_end() -> None:
+    solver: Any = importlib.import_module("mujoco.mjx._src.solver")
+    original = getattr(solver, "_while_loop_scan", None)
+    if original is None:
+        raise RuntimeError("mujoco-mjx has another line search than version 3.17: review envs/physics/mjx_patch")
+
+    def loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
+        return (_loop if _searches_end.get() else original)(condition, body, start, length)
+
+    solver._while_loop_scan = loop
 
 
 def _loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
