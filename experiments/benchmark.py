@@ -11,7 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 from ccil_jax.config import METHOD_NAMES, PRESETS, Config
 from ccil_jax.versions import versions
 from envs.registry import PHYSICS
-from experiments import command_line, devices, options, peers, run_folder
+from experiments import command_line, devices, interruption, options, peers, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.summary import show
 
@@ -123,13 +123,19 @@ def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: 
     environment = {**os.environ, "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
     if setting.get("turns"):  # an accelerator's memory is shared
         environment.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    ears, mouth = os.pipe()  # they close with this process, and then the row ends too
+    with open(ears, "rb") as stdin, open(mouth, "wb"):
+        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, check=False, env=environment)
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
-        which = f"--tasks {setting['task']}, --num-seeds {setting['num_seeds']}, --num-envs {setting['num_envs']}"
-        raise UsageError(f"{which}: cannot be measured: {last[0]}")
+        raise UsageError(f"{_name(setting)}: cannot be measured: {last[0]}")
     row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return row
+
+
+def _name(setting: Mapping[str, Any]) -> str:
+    size = f"{setting['num_seeds']} x {setting['num_envs']}"
+    return f"{setting['task']} ({setting['physics']}), {size}"
 
 
 def facts_of_machine() -> dict[str, Any]:
@@ -209,6 +215,7 @@ def print_peers(compared: Sequence[dict[str, Any]]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measures all rows, prints and writes them."""
     if arguments.row is not None:
+        interruption.stop_at_eof()
         setting = json.loads(arguments.row)
         devices.spread_seeds(setting["num_seeds"])  # as training does
         from experiments import measuring  # imports JAX
@@ -256,12 +263,13 @@ def _measured(
     """Each setting's index and row, or why it has none, as they come; `jobs` of them compile side by side."""
 
     def measure(setting: dict[str, Any]) -> dict[str, Any] | UsageError:
-        size = f"{setting['num_seeds']} x {setting['num_envs']}"
-        print(f"measuring {setting['task']}, {size} ...", file=sys.stderr, flush=True)
+        print(f"measuring {_name(setting)} ...", file=sys.stderr, flush=True)
         try:
-            return measure_row(setting, "benchmark", *options)
+            row = measure_row(setting, "benchmark", *options)
         except UsageError as error:
             return error
+        print(f"measured {_name(setting)}", file=sys.stderr, flush=True)
+        return row
 
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
         turns = {"turns": str(Path(folder) / "turns")} if jobs > 1 else {}

@@ -84,3 +84,14 @@ def _leave(number: signal.Signals) -> NoReturn:
     text = _farewell(number, "stopped; nothing that was saved is lost, and --resume continues from there")
     os.write(2, f"{cursor}\n{text}\n".encode())
     os._exit(128 + number)
+
+
+def stop_at_eof() -> None:
+    """SIGTERM for this process as soon as its standard input ends: whoever waits for it, holding that open, is gone."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 1):  # not through its buffer, whose lock Python wants when it ends
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, daemon=True).start()

@@ -46,7 +46,7 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
         metavar="BOOL",
     )
     add("preset", "hyperparameters to start from", choices=tuple(PRESETS))
-    add("physics", "engine; auto is native on a CPU, warp on an NVIDIA GPU where it is installed, else mjx", choices=PHYSICS)
+    add("physics", "engine; auto: native on CPUs, warp on NVIDIA GPUs if installed, else mjx", choices=PHYSICS)
     add("cost_threshold", "per-step threshold of the 0/1 cost (default: the task's)", type=float, metavar="X")
     add(
         "contact_cost",

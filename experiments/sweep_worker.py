@@ -5,13 +5,11 @@
 
 import argparse
 import os
-import signal
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import command_line, variants
+from experiments import command_line, interruption, variants
 from experiments.command_line import Parser
 from experiments.training import execute_together
 
@@ -28,17 +26,11 @@ def make_parser() -> Parser:
 def run(arguments: argparse.Namespace) -> None:
     """Trains, evaluates, writes the run folders."""
     if arguments.until_eof:
-        threading.Thread(target=_stop_at_eof, daemon=True).start()
+        interruption.stop_at_eof()
     if arguments.cpus and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, arguments.cpus)
     program = variants.read_program(arguments.program)
     execute_together([variant.plan for variant in program.variants], program.folder / "checkpoints")
-
-
-def _stop_at_eof() -> None:
-    while os.read(sys.stdin.fileno(), 1):  # not through its buffer, whose lock Python wants when it ends
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
 
 
 def _cpus(text: str) -> list[int]:
