@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from ccil_jax import tabular
 from ccil_jax.tabular import Array, Solution
 from experiments import figures
-from experiments.theorem1 import BETA, BETAS, BOUNDS, NUM_ROUNDS, Problem, Run
+from experiments.theorem1_checks import BETA, BETAS, BOUNDS, NUM_ROUNDS, Problem, Run
 
 BLUE, RED, GREEN = figures.COLORS[:3]
 DARK: Any = {"color": "#22262b", "linewidth": 1.2, "linestyle": (0, (5, 3))}

@@ -1,18 +1,19 @@
 """The checks of Theorem 1 hold, and fail where an ingredient is wrong."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ccil_jax import tabular
-from experiments import theorem1
-from experiments.theorem1 import Problem
+from experiments import theorem1, theorem1_checks
+from experiments.theorem1_checks import Problem
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return theorem1.make_problem(1)
+    return theorem1_checks.make_problem(1)
 
 
 def test_every_claim_holds_and_the_figure_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,17 +33,17 @@ def test_the_constraint_binds_for_one_expert_only(problem: Problem) -> None:
 def test_a_wrong_ingredient_fails(problem: Problem, monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
     if wrong == "flipped discriminator":
         monkeypatch.setattr(tabular, "best_discriminator", lambda rho, expert: expert / (rho + expert))
-        assert not all(check.passed for check in theorem1.check_discriminator(problem))
-        assert not all(check.passed for check in theorem1.check_minimax(problem))
+        assert not all(check.passed for check in theorem1_checks.check_discriminator(problem))
+        assert not all(check.passed for check in theorem1_checks.check_minimax(problem))
         return
     solution = problem.bound_by_cheap
     other = 0.5 * solution.multiplier if wrong == "half the multiplier" else 0.0
-    learner = tabular.learner(problem.process, problem.cheap, theorem1.BETA, other)
-    mistaken = theorem1.dataclasses.replace(problem, bound_by_cheap=learner)
-    assert not all(check.passed for check in theorem1.check_slackness(mistaken))
-    rounds = np.ones(theorem1.NUM_ROUNDS)
-    run = theorem1.Run(cost=rounds, multiplier=solution.multiplier * rounds, distance=0 * rounds)
-    assert theorem1.check_methods(mistaken, run, run, solution)[1].passed is False
+    learner = tabular.learner(problem.process, problem.cheap, theorem1_checks.BETA, other)
+    mistaken = dataclasses.replace(problem, bound_by_cheap=learner)
+    assert not all(check.passed for check in theorem1_checks.check_slackness(mistaken))
+    rounds = np.ones(theorem1_checks.NUM_ROUNDS)
+    run = theorem1_checks.Run(cost=rounds, multiplier=solution.multiplier * rounds, distance=0 * rounds)
+    assert theorem1_checks.check_methods(mistaken, run, run, solution)[1].passed is False
 
 
 def test_an_unwritable_folder_is_refused_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
