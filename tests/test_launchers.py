@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from ccil_jax.demonstrations import load_demonstrations
 from ccil_jax.files import file_sha256
 from experiments import evaluate, expert, options, run_folder, train
 from experiments.command_line import Parser
+from tests.probe_envs import quick_compilation
 
 TINY = ["--preset", "tiny", "--max-episode-steps", "20", "--num-seeds", "2", "--eval-episodes", "3"]
 
@@ -79,6 +81,13 @@ def test_the_expert_is_the_best_seed_within_the_limit() -> None:
     assert expert.choose_seed(rows, 30.0) == 2
     assert expert.choose_seed(rows, None) == 0
     assert expert.choose_seed(rows, 5.0) is None
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plain_code() -> Iterator[None]:
+    """What is trained here is compiled quickly."""
+    with quick_compilation():
+        yield
 
 
 @pytest.fixture(scope="module")

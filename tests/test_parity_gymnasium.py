@@ -160,7 +160,9 @@ QUICK = {("HalfCheetah", "mjx"), ("Ant", "warp")}  # to compile; Ant has contact
         for physics in ("mjx", "warp")
     ],
 )
-def test_step_on_an_accelerators_engine_equals_gymnasium(name: str, physics: str) -> None:
+def test_step_on_an_accelerators_engine_equals_gymnasium(
+    name: str, physics: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     """1e-3 in float32, contacts included; the velocities of Ant's feet set it (8e-4 worst), the median is below 1e-5.
 
     Looser than native because the solver iterates in float32; in float64 the same comparison gives 1e-13 on mjx.
@@ -168,6 +170,7 @@ def test_step_on_an_accelerators_engine_equals_gymnasium(name: str, physics: str
     expected = reference(name)
     env: Any = envs.make(name, physics=physics)
     state = one_step(env, expected)
+    assert "Module" not in capfd.readouterr().out  # Warp's own lines
     error = np.abs(state.obs - expected["obs"]) / np.maximum(1.0, np.abs(expected["obs"]))
     assert error.max() < 1e-3
     assert np.median(error.max(axis=1)) < 1e-5

@@ -209,7 +209,8 @@ def test_benchmark_settings_and_table(capsys: pytest.CaptureFixture[str]) -> Non
         assert text in out
 
 
-def test_benchmark_measures_a_row(tmp_path: Path) -> None:
+def test_benchmark_measures_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")  # its speed does not matter here
     tiny = ["--tasks", "Swimmer", "--num-seeds", "2", "--num-envs", "4", "--preset", "tiny", "--quick"]
     assert benchmark.main([*tiny, "--out", str(tmp_path / "b.json")]) == 0
     (row,) = run_folder.read_json(tmp_path / "b.json")["rows"]

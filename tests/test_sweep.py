@@ -128,7 +128,10 @@ class Killer(threading.Thread):
 
 
 @pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="finds the worker in /proc")
-def test_a_sweep_survives_a_killed_worker_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_survives_a_killed_worker_and_resumes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")  # in the workers: their programs compile sooner
     spec, out = write_spec(tmp_path), tmp_path / "out"
     killer = Killer(out)
     killer.start()

@@ -76,6 +76,7 @@ class MjxPhysics:
             from envs.physics import warp_patch
 
             warp_patch.align_plane_capsule_frames()
+            warp_patch.say_less()
         if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:
             model = copy.copy(model)
             model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON

@@ -1,4 +1,4 @@
-"""The same correction as in `mjx_patch.py`, of the friction frames of plane-capsule contacts, in MJX-Warp."""
+"""MJX-Warp's friction frames of plane-capsule contacts, corrected as in `mjx_patch.py`, and what Warp prints."""
 # mypy: ignore-errors
 # (What Warp compiles is Python by its looks only.)
 
@@ -27,6 +27,12 @@ def align_plane_capsule_frames() -> None:
             "MJX-Warp has another plane-capsule routine than mujoco-mjx 3.17: review envs/physics/warp_patch"
         )
     primitive.plane_capsule = _aligned
+
+
+def say_less() -> None:
+    """Where nobody has chosen Warp's log level: no more lines about its set-up and each of its dozens of modules."""
+    if wp.config.log_level == wp.LOG_INFO:
+        wp.config.log_level = wp.LOG_WARNING
 
 
 @wp.func
