@@ -19,7 +19,7 @@ from typing import Any
 from ccil_jax.config import METHOD_NAMES, PRESETS, Config
 from ccil_jax.versions import versions
 from envs.registry import PHYSICS
-from experiments import command_line, devices, interruption, options, peers, run_folder
+from experiments import command_line, devices, interruption, options, peers, run_folder, workers
 from experiments.command_line import Parser, UsageError
 from experiments.summary import show
 
@@ -118,9 +118,8 @@ def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]
 def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
     """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
     command = [sys.executable, "-m", f"experiments.{launcher}", *options, "--row", json.dumps(setting)]
-    path = os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     # The compilation is measured, so nothing may come from a cache.
-    environment = {**os.environ, "PYTHONPATH": path, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    environment = {**os.environ, "PYTHONPATH": workers.python_path(), "JAX_ENABLE_COMPILATION_CACHE": "false"}
     if setting.get("turns"):  # an accelerator's memory is shared
         environment.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     ears, mouth = os.pipe()  # they close with this process, and then the row ends too
@@ -131,6 +130,14 @@ def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: 
         raise UsageError(f"{_name(setting)}: cannot be measured: {last[0]}")
     row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return row
+
+
+def begin_row(text: str) -> dict[str, Any]:
+    """In a row's own process: the setting that `measure_row` gave it, once this process is as training's would be."""
+    interruption.stop_at_eof()
+    setting: dict[str, Any] = json.loads(text)
+    devices.spread_seeds(setting["num_seeds"])
+    return setting
 
 
 def _name(setting: Mapping[str, Any]) -> str:
@@ -215,9 +222,7 @@ def print_peers(compared: Sequence[dict[str, Any]]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measures all rows, prints and writes them."""
     if arguments.row is not None:
-        interruption.stop_at_eof()
-        setting = json.loads(arguments.row)
-        devices.spread_seeds(setting["num_seeds"])  # as training does
+        setting = begin_row(arguments.row)
         from experiments import measuring  # imports JAX
 
         if arguments.profile:

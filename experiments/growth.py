@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.config import METHOD_NAMES
-from experiments import benchmark, command_line, devices, interruption, options, run_folder
+from experiments import benchmark, command_line, options, run_folder
 from experiments.command_line import Parser
 from experiments.summary import show
 
@@ -139,9 +139,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measures all points, prints, draws and writes them."""
     if arguments.row is not None:
-        interruption.stop_at_eof()
-        setting = json.loads(arguments.row)
-        devices.spread_seeds(setting["num_seeds"])  # as training does
+        setting = benchmark.begin_row(arguments.row)
         from experiments import measuring  # imports JAX
 
         print(json.dumps(measuring.measure_training(measuring.Setting(**setting))))

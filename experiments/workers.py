@@ -68,7 +68,7 @@ def run_worker(folder: Path, cpus: Sequence[int] = (), stopping: threading.Event
                 start_new_session=True,  # and not by a Ctrl-C, after which it would be tried again
                 stdout=output,
                 stderr=output,
-                env={**os.environ, "PYTHONPATH": _python_path()},
+                env={**os.environ, "PYTHONPATH": python_path()},
             ) as process,
         ):
             while process.poll() is None:
@@ -112,7 +112,7 @@ def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
     """Tasks of a Ray cluster: the one that RAY_ADDRESS names, else one on this machine."""
     import ray
 
-    ray.init(runtime_env={"env_vars": {"PYTHONPATH": _python_path()}}, log_to_driver=False)
+    ray.init(runtime_env={"env_vars": {"PYTHONPATH": python_path()}}, log_to_driver=False)
     try:
         cpus = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
         share = max(1, min(max(cpus), sum(cpus) // num_workers))  # a task that no node can hold would wait for ever
@@ -166,8 +166,8 @@ def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settin
             job.cancel(check=False)
 
 
-def _python_path() -> str:
-    """A worker imports the packages that this process did."""
+def python_path() -> str:
+    """PYTHONPATH of a worker, which imports the packages that this process did."""
     return os.pathsep.join([str(Path(__file__).parent.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
 
 

@@ -15,6 +15,7 @@ from experiments import benchmark, growth, peers
 from experiments.command_line import UsageError
 from experiments.peers import Peer
 from experiments.turns import turn
+from tests.processes import command_lines, in_proc
 
 SCRIPT = """
 import json, pathlib, sys
@@ -100,34 +101,25 @@ def test_rows_that_fail_do_not_spoil_the_others(
     assert len(turns) == 1
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="children are read from Linux's /proc")
+@in_proc
 def test_a_row_ends_with_whoever_waits_for_it(tmp_path: Path) -> None:
+    def runs() -> bool:
+        return any("--row" in words and '"seed": 271828' in words[-2] for words in command_lines().values())
+
     command = [sys.executable, "-m", "experiments.benchmark", "--tasks", "Swimmer", "--num-seeds", "1"]
+    command += ["--seed", "271828", "--out", str(tmp_path / "b.json")]
+    deadline = time.monotonic() + 60
     ears, mouth = os.pipe()
     with open(ears, "rb") as stdin, open(mouth, "wb"):  # not this is what ends
-        process = subprocess.Popen([*command, "--out", tmp_path / "b.json"], stdin=stdin, stderr=subprocess.DEVNULL)
-        tasks, deadline = Path(f"/proc/{process.pid}/task"), time.monotonic() + 60
-        while not (rows := _rows_of(tasks)):
+        process = subprocess.Popen(command, stdin=stdin, stderr=subprocess.DEVNULL)
+        while not runs():
             assert time.monotonic() < deadline
             time.sleep(0.01)
         process.kill()
         process.wait()
-        while any(_runs(pid) for pid in rows):
+        while runs():
             assert time.monotonic() < deadline
             time.sleep(0.1)
-
-
-def _rows_of(tasks: Path) -> list[str]:
-    children = [pid for file in tasks.glob("*/children") for pid in file.read_text().split()]
-    return [pid for pid in children if b"--row" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-
-
-def _runs(pid: str) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"  # dead, and not yet asked for
 
 
 def test_who_measures_is_alone(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from experiments import run_folder, sweep, variants, workers
+from tests.processes import command_lines, in_proc
 
 FIXED = {"preset": "tiny", "num_seeds": 2, "max_episode_steps": 20, "eval_episodes": 3, "cost_limit": 5.0}
 SPEC: dict[str, Any] = {"env": "Swimmer", "method": "expert", "fixed": FIXED}
@@ -115,19 +116,11 @@ class Killer(threading.Thread):
 
     @staticmethod
     def _workers(folder: Path) -> list[int]:
-        commands = {path.parent.name: path for path in Path("/proc").glob("[0-9]*/cmdline")}
-        found = []
-        for pid, path in commands.items():
-            try:
-                words = path.read_bytes().split(b"\0")
-            except OSError:  # it has ended
-                continue
-            if b"experiments.sweep_worker" in words and str(folder).encode() in words:
-                found.append(int(pid))
-        return found
+        wanted = {"experiments.sweep_worker", str(folder)}
+        return [pid for pid, words in command_lines().items() if wanted <= set(words)]
 
 
-@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="finds the worker in /proc")
+@in_proc
 def test_a_sweep_survives_a_killed_worker_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
