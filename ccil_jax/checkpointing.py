@@ -18,8 +18,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from ccil_jax import digests
-from ccil_jax.config import Config
-from ccil_jax.digests import CheckpointError, DamageError
+from ccil_jax.digests import CheckpointError, DamageError, Identity
 from ccil_jax.files import DISK_IS_FULL
 from ccil_jax.types import PyTree
 from envs.base import numbers
@@ -36,7 +35,7 @@ class Checkpointer:
 
     Args:
         directory: made if need be. One writer at a time: hold its lock (`ccil_jax.files`).
-        config: of the run; a step that was written under another is refused.
+        identity: of the training; a step of another is refused.
         free: further fields in which the configurations may differ.
         readonly: never touches what is there, so that a run can be read while it is written.
     """
@@ -44,13 +43,13 @@ class Checkpointer:
     def __init__(
         self,
         directory: Path,
-        config: Config | None = None,
+        identity: Identity | None = None,
         *,
         free: frozenset[str] = frozenset(),
         readonly: bool = False,
     ) -> None:
         self._directory = directory.resolve()  # orbax fails in the background on a relative path
-        self._config, self._free, self._readonly = config, free | _FREE, readonly
+        self._identity, self._free, self._readonly = identity, free | _FREE, readonly
         handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
         with _warnings_of_orbax(logging.ERROR if readonly else logging.NOTSET):  # it warns of what was asked for
             options = ocp.CheckpointManagerOptions(
@@ -92,29 +91,66 @@ class Checkpointer:
         for folder, reason in passed:
             remedy = "starting over" if good is None else f"going on from step {good}"
             _log.warning("warning: %s; %s", reason, remedy)
-            self._set_aside(folder)
+            self._set_aside(folder, "damaged")
         return good
 
-    def _set_aside(self, folder: Path) -> None:
+    def _set_aside(self, folder: Path, suffix: str) -> None:
         if self._readonly:
             return
-        target = folder.with_name(f"{folder.name}.damaged")
+        target = folder.with_name(f"{folder.name}.{suffix}")
         shutil.rmtree(target, ignore_errors=True)
         folder.rename(target)
         self._manager.reload()
 
+    def check_identity(self, step: int) -> None:
+        """Raises `CheckpointError` where the step is of another training; reads no array, so it is quickly done."""
+        folder = self._directory / str(step)
+        digests.check_identity(folder, digests.read(folder), self._identity, self._free)
+
+    def check_empty(self) -> None:
+        """Raises `CheckpointError` where there are steps already, which a new training would mix with its own."""
+        if steps := sorted(self._manager.all_steps()):
+            raise CheckpointError(
+                f"{self._directory}: holds checkpoints already (steps {', '.join(map(str, steps))}); resume that "
+                "training, or choose another folder"
+            )
+
+    def replace(self, step: int, state: PyTree) -> None:
+        """Saves as `save` does what another training may have saved here before.
+
+        A step that holds the same arrays stays as it is; all others are set aside under the name `N.replaced`.
+        """
+        folder = self._directory / str(step)
+        with contextlib.suppress(DamageError):
+            if digests.read(folder)["arrays"] == digests.describe(state):
+                return
+        for old in sorted(self._manager.all_steps()):
+            self._set_aside(self._directory / str(old), "replaced")
+        self.save(step, state)
+
     def save(self, step: int, state: PyTree) -> None:
-        """Saves, and proves that it is on disk. Raises `CheckpointError` where the disk is full or fails."""
+        """Saves, and proves that it is on disk.
+
+        Raises:
+            CheckpointError: the disk is full or fails, or the step is there already: what is saved is never replaced.
+        """
         needed = sum(numbers(leaf).nbytes for leaf in jax.tree.leaves(state)) + _OVERHEAD
         free = shutil.disk_usage(self._directory).free
         folder = self._directory / str(step)
+        if folder.exists():
+            raise CheckpointError(f"{folder}: exists already; resume from it, or choose another folder")
         if free < needed:
             raise CheckpointError(self._no_space(folder, needed, free))
         try:
-            self._manager.save(step, args=ocp.args.StandardSave(state))
+            if not self._manager.save(step, args=ocp.args.StandardSave(state)):  # it says no in silence
+                raise CheckpointError(
+                    f"{folder}: not saved, as {self._directory} holds a later step; choose another folder"
+                )
             # Waiting costs little and tells of a failure now, not one save later.
             self._manager.wait_until_finished()
-            digests.write(folder, state, self._config)
+            digests.write(folder, state, self._identity)
+        except CheckpointError:
+            raise
         except (OSError, ValueError, RuntimeError) as error:  # TensorStore reports the system's errors as ValueError
             if _is_disk_error(error):
                 free = shutil.disk_usage(self._directory).free
@@ -138,7 +174,7 @@ class Checkpointer:
         """
         folder = self._directory / str(step)
         manifest = digests.read(folder)
-        digests.check_config(folder, manifest, self._config, self._free)
+        digests.check_identity(folder, manifest, self._identity, self._free)
         digests.check_arrays(folder, manifest, jax.tree.map(_shape, like))
         try:
             state = self._manager.restore(step, args=ocp.args.StandardRestore(like))

@@ -6,16 +6,13 @@ sweeping it needs no compilation, and it may differ between vmapped runs).
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
 
-METHOD_NAMES = ("malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il", "bc", "iq_learn", "trpo", "expert")
-ADVERSARIAL_METHODS = frozenset({"malm", "cvag", "ccil", "lgail", "gail", "cpo_il", "pid_il"})  # by a discriminator
-IMITATION_METHODS = ADVERSARIAL_METHODS | {"bc", "iq_learn"}
-PRESCRIBED_LIMIT_METHODS = frozenset({"lgail", "expert"})
+from ccil_jax.methods import METHODS, Method
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
-    "method": METHOD_NAMES,
+    "method": tuple(METHODS),
     "activation": ("tanh", "relu", "swish"),
     "meta_gradient": ("full", "direct", "indirect", "none"),
     "outer_advantage": ("stale", "re-evaluated"),
@@ -33,12 +30,73 @@ class ConfigError(ValueError):
     """A configuration that cannot run. The message names the option and the remedy."""
 
 
-def _static(default: Any, help: str) -> Any:
-    return dataclasses.field(default=default, metadata={"traced": False, "help": help})
+class Use(NamedTuple):
+    """Which configurations a field matters to; to all others it makes no difference, so they refuse it."""
+
+    who: str  # completes "used by ..."
+    methods: tuple[str, ...]
+    where: Callable[["Config"], bool] = lambda config: True  # what other fields must hold besides
+
+    def holds(self, config: "Config") -> bool:
+        """Whether the field matters to `config`."""
+        return config.method in self.methods and self.where(config)
 
 
-def _traced(default: float | None, help: str) -> Any:
-    return dataclasses.field(default=default, metadata={"traced": True, "help": help})
+def _methods(who: str, holds: Callable[[Method], bool]) -> Use:
+    """A use that the method alone decides."""
+    return Use(who, tuple(name for name, row in METHODS.items() if holds(row)))
+
+
+def _named(who: str, holds: Callable[[Method], bool]) -> Use:
+    """The same, with the names of the methods beside it, or in its place where `who` is empty."""
+    names = ", ".join(_methods(who, holds).methods)
+    return _methods(f"{who} ({names})" if who else names, holds)
+
+
+ALL = _methods("every method", lambda row: True)
+ACTING = _methods("every method that acts while it learns: all but bc", lambda row: row.agent != "behavior_cloning")
+ON_POLICY = _methods("every on-policy method: all but bc and iq_learn", lambda row: row.agent == "on_policy")
+ADVERSARIAL = _named("methods with a discriminator", lambda row: row.reward == "discriminator")
+PENALIZED = Use(
+    "methods with a discriminator whose discriminator_regularizer is gradient_penalty",
+    ADVERSARIAL.methods,
+    lambda config: config.discriminator_regularizer == "gradient_penalty",
+)
+CONSTRAINED = _named("methods in which the cost enters", lambda row: row.limit is not None)
+LIMITED = _named("methods with a prescribed limit", lambda row: row.limit == "prescribed")
+LAGRANGIAN = _named(
+    "methods with a choice of multiplier", lambda row: row.constraint in ("lagrangian", "meta_lagrangian")
+)
+ASCENT = Use(
+    f"{', '.join(LAGRANGIAN.methods)} whose multiplier_update is adam or sgd",
+    LAGRANGIAN.methods,
+    lambda config: config.multiplier_update in ("adam", "sgd"),
+)
+PID = Use(
+    f"pid_il, and {', '.join(LAGRANGIAN.methods)} whose multiplier_update is pid",
+    (*LAGRANGIAN.methods, "pid_il"),
+    lambda config: config.row.constraint == "pid" or config.multiplier_update == "pid",
+)
+MULTIPLIER = Use(
+    f"pid_il, and {', '.join(LAGRANGIAN.methods)} unless multiplier_update is optimal",
+    PID.methods,
+    lambda config: config.has_multiplier,
+)
+MALM = _named("", lambda row: row.constraint == "meta_lagrangian")
+HELD_OUT = Use("malm whose held_out_fraction is above 0", MALM.methods, lambda config: config.held_out_fraction > 0)
+META = Use("malm unless meta_gradient is none", MALM.methods, lambda config: config.meta_gradient != "none")
+CVAG = _named("", lambda row: row.constraint == "alternating")
+BC = _named("", lambda row: row.agent == "behavior_cloning")
+IQ_LEARN = _named("", lambda row: row.agent == "iq_learn")
+OFF_POLICY = _named("", lambda row: row.agent != "on_policy")
+
+
+def _static(default: Any, help: str, use: Use = ON_POLICY) -> Any:
+    return dataclasses.field(default=default, metadata={"traced": False, "help": help, "use": use})
+
+
+def _traced(default: float | None, help: str, use: Use = ON_POLICY) -> Any:
+    return dataclasses.field(default=default, metadata={"traced": True, "help": help, "use": use})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,85 +106,136 @@ class Config:
     Sources beyond Table 1 are in the field's help text; "authors" means the paper's public code.
     """
 
-    method: str = _static("malm", "row of the methods table")
-    env_steps: int = _static(3_000_000, "environment steps per seed, rounded up to whole iterations")
-    num_envs: int = _static(16, "simulations stepped side by side, per seed")
-    batch_size: int = _static(2000, "environment steps per generator step, K (Table 1)")
-    generator_steps: int = _static(3, "policy updates per iteration, each on a fresh batch (Table 1)")
+    method: str = _static("malm", "row of the methods table", ALL)
+    env_steps: int = _static(3_000_000, "environment steps per seed, rounded up to whole iterations", ACTING)
+    num_envs: int = _static(16, "simulations stepped side by side, per seed", ACTING)
+    batch_size: int = _static(2000, "environment steps per generator step, K (Table 1)", ACTING)
+    generator_steps: int = _static(3, "policy updates per iteration, each on a fresh batch (Table 1)", ACTING)
     discriminator_steps: int = _static(
-        1, "discriminator updates per iteration (Table 1), each a pass over the last batch in minibatches"
+        1, "discriminator updates per iteration (Table 1), each a pass over the last batch in minibatches", ADVERSARIAL
     )
     discriminator_minibatch_size: int = _static(
-        128, "samples of either class per discriminator gradient step; the authors take the whole batch at once"
+        128,
+        "samples of either class per discriminator gradient step; the authors take the whole batch at once",
+        ADVERSARIAL,
     )
-    held_out_fraction: float = _static(0.3, "share of the batch kept for the outer loss, malm only (authors)")
-    hidden_sizes: tuple[int, ...] = _static((100, 100), "hidden layers of policy, critics and discriminator (Table 1)")
-    activation: str = _static("tanh", "activation of every network (Table 1)")
-    meta_gradient: str = _static("full", "outer step of malm: total derivative, one of its two parts, or none")
+    held_out_fraction: float = _static(0.3, "share of the batch kept for the outer loss (authors)", MALM)
+    hidden_sizes: tuple[int, ...] = _static(
+        (100, 100), "hidden layers of policy, critics and discriminator (Table 1)", ALL
+    )
+    activation: str = _static("tanh", "activation of every network (Table 1)", ALL)
+    meta_gradient: str = _static("full", "outer step: total derivative, one of its two parts, or none", MALM)
     outer_advantage: str = _static(
-        "stale", "outer loss of malm: advantages as the policy step saw them (authors), or by the updated networks"
+        "stale",
+        "outer loss: advantages as the policy step saw them (authors), or by the updated networks",
+        META,
     )
     held_out_unit: str = _static(
-        "transition", "what is drawn for the outer loss: steps (authors), or whole simulations' stretches of the batch"
+        "transition",
+        "what is drawn for the outer loss: steps (authors), or whole simulations' stretches of the batch",
+        HELD_OUT,
     )
     multiplier_update: str = _static(
         "adam",
         "dual step: adam on softplus(xi) (authors), projected sgd (Algorithm 1), a pid controller, or the optimal "
         "value for each single step",
+        LAGRANGIAN,
     )
     meta_update: str = _static(
-        "adam", "outer step: adam on the multiplier's parameter (authors) or sgd on lambda (line 16)"
+        "adam", "outer step: adam on the multiplier's parameter (authors) or sgd on lambda (line 16)", META
     )
-    gate: str = _static("batch", "cvag: one decision per batch (Algorithm 2) or per episode (authors)")
+    gate: str = _static("batch", "one decision per batch (Algorithm 2) or per episode (authors)", CVAG)
     reward_form: str = _static(
-        "softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)"
+        "softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)", ADVERSARIAL
     )
-    discriminator_regularizer: str = _static("gradient_penalty", "what keeps the discriminator smooth")
+    discriminator_regularizer: str = _static("gradient_penalty", "what keeps the discriminator smooth", ADVERSARIAL)
     cg_iterations: int = _static(10, "conjugate-gradient iterations (authors)")
     fisher_stride: int = _static(5, "the Fisher product uses every n-th sample (authors)")
     line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
     critic_epochs: int = _static(5, "passes over the batch per critic regression (authors)")
     critic_minibatch_size: int = _static(
-        128, "samples per critic gradient step (authors); per step of bc; of either source per step of iq_learn"
+        128, "samples per critic gradient step (authors); per step of bc; of either source per step of iq_learn", ALL
     )
-    standardize_cost_advantage: bool = _static(False, "also divide the cost advantage by its deviation")
+    standardize_cost_advantage: bool = _static(False, "also divide the cost advantage by its deviation", CONSTRAINED)
     bootstrap_at_truncation: bool = _static(True, "use the critic's value at a time limit; false zeroes it (authors)")
-    bc_epochs: int = _static(200, "passes over the demonstrations, bc only: its iterations")
-    replay_size: int = _static(200_000, "latest steps that iq_learn learns from (published: 1e6, never filled here)")
-    updates_per_step: int = _static(1, "gradient updates per environment step, iq_learn only (published)")
+    bc_epochs: int = _static(200, "passes over the demonstrations; each is an iteration", BC)
+    replay_size: int = _static(
+        200_000, "latest steps that are learnt from (published: 1e6, never filled here)", IQ_LEARN
+    )
+    updates_per_step: int = _static(1, "gradient updates per environment step (published)", IQ_LEARN)
     value_loss: str = _static(
-        "value", "second term of iq_learn's loss: V - y over expert and learner, or v0, (1 - gamma) V at first states"
+        "value",
+        "second term of the loss: V - y over expert and learner, or v0, (1 - gamma) V at first states",
+        IQ_LEARN,
     )
     max_skipped_updates: int = _static(
-        10, "a seed stops after so many iterations in a row that were not finite; each is taken back"
+        10, "a seed stops after so many iterations in a row that were not finite; each is taken back", ALL
     )
 
-    gamma: float = _traced(0.995, "discount of reward and cost (Table 1)")
+    gamma: float = _traced(0.995, "discount of reward and cost (Table 1)", ACTING)
     gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation, of the reward (Table 1)")
-    cost_gae_lambda: float = _traced(0.97, "the same, of the cost (Table 1)")
+    cost_gae_lambda: float = _traced(0.97, "the same, of the cost (Table 1)", CONSTRAINED)
     max_kl: float = _traced(0.01, "trust-region radius, nats (Table 1)")
     kl_tolerance: float = _traced(1.5, "a step is accepted up to this multiple of max_kl (authors)")
     cg_damping: float = _traced(0.1, "added to the Fisher matrix's diagonal (authors)")
-    critic_learning_rate: float = _traced(1e-3, "Adam, both critics (Table 1)")
-    discriminator_learning_rate: float = _traced(3e-4, "Adam (Table 1)")
+    critic_learning_rate: float = _traced(1e-3, "Adam, both critics (Table 1)", ACTING)
+    discriminator_learning_rate: float = _traced(3e-4, "Adam (Table 1)", ADVERSARIAL)
     policy_entropy_coefficient: float = _traced(0.0, "beta, weight of the policy's entropy (Table 1)")
-    discriminator_entropy_coefficient: float = _traced(1e-3, "weight of the discriminator's entropy bonus (Table 1)")
-    gradient_penalty_coefficient: float = _traced(1.0, "weight of the gradient penalty")
-    initial_multiplier: float = _traced(0.01, "lambda before the first iteration (Table 1)")
-    multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)")
-    meta_learning_rate: float = _traced(0.05, "outer step size, malm only (Table 1)")
-    multiplier_max: float = _traced(100.0, "cap of the multiplier")
-    pid_proportional_gain: float = _traced(0.5, "of the smoothed cost gap, relative to the limit; pid only")
-    pid_integral_gain: float = _traced(0.05, "of the sum of relative gaps; pid only")
-    pid_derivative_gain: float = _traced(0.5, "of the rise of the smoothed relative gap; pid only")
-    pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap that stays; pid only")
-    actor_learning_rate: float = _traced(1e-3, "Adam, policy of bc and iq_learn")
-    target_update_rate: float = _traced(0.005, "Polyak average of iq_learn's target critic (published)")
-    chi2_coefficient: float = _traced(0.5, "alpha of iq_learn's chi-square term, r^2 / (4 alpha) (published)")
-    temperature: float | None = _traced(None, "weight of iq_learn's entropy; none: the task's published value")
-    cost_limit: float | None = _traced(
-        None, "episode cost limit; imitation takes the demonstrations' mean unless lgail"
+    discriminator_entropy_coefficient: float = _traced(
+        1e-3, "weight of the discriminator's entropy bonus (Table 1)", ADVERSARIAL
     )
+    gradient_penalty_coefficient: float = _traced(1.0, "weight of the gradient penalty", PENALIZED)
+    initial_multiplier: float = _traced(0.01, "lambda before the first iteration (Table 1)", MULTIPLIER)
+    multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)", ASCENT)
+    meta_learning_rate: float = _traced(0.05, "outer step size (Table 1)", META)
+    multiplier_max: float = _traced(100.0, "cap of the multiplier", MULTIPLIER)
+    pid_proportional_gain: float = _traced(0.5, "of the smoothed cost gap, relative to the limit", PID)
+    pid_integral_gain: float = _traced(0.05, "of the sum of relative gaps", PID)
+    pid_derivative_gain: float = _traced(0.5, "of the rise of the smoothed relative gap", PID)
+    pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap that stays", PID)
+    actor_learning_rate: float = _traced(1e-3, "Adam, policy of bc and iq_learn", OFF_POLICY)
+    target_update_rate: float = _traced(0.005, "Polyak average of the target critic (published)", IQ_LEARN)
+    chi2_coefficient: float = _traced(0.5, "alpha of the chi-square term, r^2 / (4 alpha) (published)", IQ_LEARN)
+    temperature: float | None = _traced(None, "weight of the entropy; none: the task's published value", IQ_LEARN)
+    cost_limit: float | None = _traced(
+        None, "episode cost limit; all other constrained methods take the demonstrations' mean", LIMITED
+    )
+
+    @classmethod
+    def from_preset(cls, preset: str, **changes: Any) -> "Config":
+        """The preset with `changes` on top. What it says of fields that the method does not use is left out.
+
+        Raises:
+            ConfigError: the preset or a field is unknown, or a change is of a field that the method does not use.
+        """
+        if preset not in PRESETS:
+            raise ConfigError(f"--preset {preset!r}: unknown; choose one of {', '.join(PRESETS)}")
+        return cls.from_base(PRESETS[preset], changes)
+
+    @classmethod
+    def from_base(cls, base: Mapping[str, Any], changes: Mapping[str, Any]) -> "Config":
+        """As `from_preset`, with the fields of the preset given."""
+        if unknown := changes.keys() - _DEFAULTS.keys():
+            raise ConfigError(f"--{min(unknown)}: unknown; no field of Config has that name")
+        config = cls(**{**base, **changes})
+        _check_choices(config)
+        check_used(config, changes)
+        return config.replace(**{name: _DEFAULTS[name] for name in unused(config) if name not in changes})
+
+    @property
+    def row(self) -> Method:
+        """The method's row of the table."""
+        return METHODS[self.method]
+
+    @property
+    def prescribed_limit(self) -> float | None:
+        """The episode cost limit that the user has given; None where the method has none, or the demonstrations'."""
+        return self.cost_limit if self.row.limit == "prescribed" else None
+
+    @property
+    def has_multiplier(self) -> bool:
+        """Whether the cost is weighed by a multiplier that is carried from one iteration to the next."""
+        return self.row.constraint == "pid" or (LAGRANGIAN.holds(self) and self.multiplier_update != "optimal")
 
     @property
     def num_steps(self) -> int:
@@ -136,17 +245,17 @@ class Config:
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps that one iteration of one seed consumes; behaviour cloning needs none."""
-        return 0 if self.method == "bc" else self.generator_steps * self.batch_size
+        return 0 if BC.holds(self) else self.generator_steps * self.batch_size
 
     @property
     def num_iterations(self) -> int:
         """Iterations needed to consume at least `env_steps`; passes over the demonstrations for behaviour cloning."""
-        return self.bc_epochs if self.method == "bc" else math.ceil(self.env_steps / self.steps_per_iteration)
+        return self.bc_epochs if BC.holds(self) else math.ceil(self.env_steps / self.steps_per_iteration)
 
     @property
     def num_held_out(self) -> int:
         """V: samples kept for the outer loss; 0 for every method but malm."""
-        if self.method != "malm":
+        if not MALM.holds(self):
             return 0
         if self.held_out_unit == "trajectory":
             return int(self.held_out_fraction * self.num_envs) * self.num_steps
@@ -165,6 +274,58 @@ class Config:
 def field_names(*, traced: bool) -> tuple[str, ...]:
     """Names of the traced or of the static fields, in declaration order."""
     return tuple(f.name for f in dataclasses.fields(Config) if f.metadata["traced"] is traced)
+
+
+_USES: Mapping[str, Use] = {f.name: f.metadata["use"] for f in dataclasses.fields(Config)}
+_DEFAULTS: Mapping[str, Any] = {f.name: f.default for f in dataclasses.fields(Config)}
+
+
+def unused(config: Config) -> tuple[str, ...]:
+    """Names of the fields that make no difference to what `config` trains.
+
+    `cost_limit` is among them where a method takes its limit from the demonstrations: it is not for the user to give.
+    """
+    return tuple(name for name, use in _USES.items() if not use.holds(config))
+
+
+def relevant(config: Config) -> dict[str, Any]:
+    """The fields that tell one training from another, by name. The limit of the demonstrations' is told by them."""
+    idle = unused(config)
+    return {name: value for name, value in dataclasses.asdict(config).items() if name not in idle}
+
+
+def with_limit_of(config: Config, mean_episode_cost: float) -> Config:
+    """The configuration with its cost limit resolved: J_E where the method takes it from the demonstrations.
+
+    Raises:
+        ConfigError: another limit was given by hand.
+    """
+    if config.row.limit != "demonstrations":
+        return config
+    if config.cost_limit not in (None, mean_episode_cost):
+        raise ConfigError(_limit_by_hand(config))
+    return config.replace(cost_limit=mean_episode_cost)
+
+
+def _limit_by_hand(config: Config) -> str:
+    return (
+        f"--cost_limit {config.cost_limit}: method {config.method} is held to the mean cost of its demonstrations; "
+        "leave it out, or use --method lgail for a limit of your own"
+    )
+
+
+def check_used(config: Config, given: Iterable[str]) -> None:
+    """Raises `ConfigError` for the first of the fields `given` by hand that makes no difference to `config`."""
+    idle = unused(config)
+    for name in given:
+        if name not in idle:
+            continue
+        if name == "cost_limit" and config.row.limit == "demonstrations":
+            raise ConfigError(_limit_by_hand(config))
+        raise ConfigError(
+            f"--{name} {getattr(config, name)}: makes no difference to this run of method {config.method}; leave it "
+            f"out (used by {_USES[name].who})"
+        )
 
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -242,11 +403,21 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def validate(config: Config) -> None:
-    """Raises `ConfigError` for a combination that cannot run, before anything is compiled."""
+def _check_choices(config: Config) -> None:
     for name, allowed in CHOICES.items():
         if getattr(config, name) not in allowed:
             raise ConfigError(f"--{name} {getattr(config, name)!r}: unknown; choose one of {', '.join(allowed)}")
+
+
+def validate(config: Config) -> None:
+    """Raises `ConfigError` for a combination that cannot run, before anything is compiled.
+
+    A field that makes no difference must have its default: any other value was given by hand, in vain. A resolved
+    limit of the demonstrations' is let through; `with_limit_of` compares it with them.
+    """
+    _check_choices(config)
+    resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
+    check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))
     for name in (
         "env_steps",
         "num_envs",
@@ -284,40 +455,42 @@ def validate(config: Config) -> None:
         )
     if not 0 <= config.held_out_fraction < 1:
         raise ConfigError(f"--held_out_fraction {config.held_out_fraction}: must be in [0, 1)")
-    if config.method == "malm" and config.multiplier_update not in ("adam", "sgd"):
+    if MALM.holds(config) and config.multiplier_update not in ("adam", "sgd"):
         raise ConfigError(
             f"--multiplier_update {config.multiplier_update}: has no parameter for malm's outer step; use adam or sgd, "
             f"or --method ccil"
         )
-    if config.standardize_cost_advantage and (config.method == "cpo_il" or config.multiplier_update == "optimal"):
+    if config.standardize_cost_advantage and (
+        config.row.constraint == "trust_region_optimal" or config.multiplier_update == "optimal"
+    ):
         raise ConfigError(
             "--standardize_cost_advantage true: the optimal multiplier compares the cost's surrogate with its gap, so "
             "it must keep its unit; leave it out"
         )
     if config.pid_smoothing >= 1:
         raise ConfigError(f"--pid_smoothing {config.pid_smoothing}: must be below 1, or no gap is ever felt")
-    if config.method == "malm" and config.meta_gradient != "none" and config.num_held_out == 0:
+    if META.holds(config) and config.num_held_out == 0:
         raise ConfigError(
             f"--held_out_fraction {config.held_out_fraction}: malm's outer loss needs held-out samples; "
             "use --held_out_fraction 0.3, or --meta_gradient none for the Lagrangian method"
         )
-    if config.critic_minibatch_size > config.num_training:
+    if ON_POLICY.holds(config) and config.critic_minibatch_size > config.num_training:
         raise ConfigError(
             f"--critic_minibatch_size {config.critic_minibatch_size} exceeds the {config.num_training} training "
             f"samples of a batch; use --critic_minibatch_size {config.num_training} or less"
         )
-    if config.method in ADVERSARIAL_METHODS and config.discriminator_minibatch_size > config.batch_size:
+    if ADVERSARIAL.holds(config) and config.discriminator_minibatch_size > config.batch_size:
         raise ConfigError(
             f"--discriminator_minibatch_size {config.discriminator_minibatch_size} exceeds the batch; "
             f"use --discriminator_minibatch_size {config.batch_size} or less"
         )
-    if config.num_training < config.fisher_stride:
+    if ON_POLICY.holds(config) and config.num_training < config.fisher_stride:
         raise ConfigError(f"--fisher_stride {config.fisher_stride} exceeds the {config.num_training} training samples")
-    if config.method == "iq_learn" and config.replay_size < config.num_envs:
+    if IQ_LEARN.holds(config) and config.replay_size < config.num_envs:
         raise ConfigError(
             f"--replay_size {config.replay_size}: holds not even one step of {config.num_envs} simulations"
         )
-    if config.method == "iq_learn" and config.chi2_coefficient == 0:
+    if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
-    if config.method in PRESCRIBED_LIMIT_METHODS and config.cost_limit is None:
+    if LIMITED.holds(config) and config.cost_limit is None:
         raise ConfigError(f"--cost_limit: method {config.method} needs a prescribed episode cost limit")

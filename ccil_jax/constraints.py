@@ -6,7 +6,7 @@ mean cost of finished episodes less the limit; `step_gap` is the same per step, 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import jax
@@ -198,6 +198,22 @@ def inverse_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
     """xi with softplus(xi) = value, for value >= SMALLEST_SOFTPLUS_MULTIPLIER (smaller values are raised to it)."""
     value = jnp.maximum(value, SMALLEST_SOFTPLUS_MULTIPLIER)
     return value + jnp.log(-jnp.expm1(-value))
+
+
+CONSTRAINTS: Mapping[str, Callable[[Config], Constraint]] = {  # by the names in `methods.METHODS`
+    "unconstrained": unconstrained,
+    "lagrangian": lagrangian,
+    "meta_lagrangian": meta_lagrangian,
+    "alternating": alternating,
+    "trust_region_optimal": trust_region_optimal,
+    "pid": pid,
+}
+
+
+def make(config: Config) -> Constraint:
+    """The constraint of `config.method`, an on-policy one."""
+    assert config.row.constraint is not None, f"{config.method} has no policy step to constrain"
+    return CONSTRAINTS[config.row.constraint](config)
 
 
 class Ascent(NamedTuple):

@@ -7,18 +7,19 @@ import dataclasses
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from ccil_jax.config import Config, ConfigError
+from ccil_jax.config import Config, ConfigError, unused
+from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.files import file_sha256
 from ccil_jax.types import PyTree
 from ccil_jax.versions import versions
-from envs.base import numbers
+from envs.base import Environment, numbers
 
 NAME = "manifest.json"
 
@@ -45,10 +46,50 @@ def _describe(leaf: Any) -> dict[str, Any]:
     return {**facts, "sha256": hashlib.sha256(values.tobytes()).hexdigest()}
 
 
-def write(folder: Path, state: PyTree, config: Config | None) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Identity:
+    """Which training a checkpoint is of. What is None is not known, and is not compared.
+
+    Its runs are [len(configs) * num_seeds]: configuration after configuration, each with its seeds in turn.
+    """
+
+    configs: tuple[Config, ...]  # resolved
+    num_seeds: int | None = None  # of each configuration
+    seed: int | None = None  # of their keys
+    task: str | None = None
+    max_episode_steps: int | None = None
+    demonstrations: str | None = None  # SHA-256 of what is learnt from; "none" where the method does not imitate
+
+
+def identity_of(
+    configs: Sequence[Config], env: Environment, demonstrations: Demonstrations | None, num_seeds: int, seed: int
+) -> Identity:
+    """The identity of a training of resolved configurations."""
+    learnt_from = demonstrations if configs[0].row.imitates else None
+    return Identity(
+        configs=tuple(configs),
+        num_seeds=num_seeds,
+        seed=seed,
+        task=env.name,
+        max_episode_steps=env.max_episode_steps,
+        demonstrations="none" if learnt_from is None else demonstrations_sha256(learnt_from),
+    )
+
+
+def demonstrations_sha256(demonstrations: Demonstrations) -> str:
+    """Digest of every array that a learner sees, whatever file they came from."""
+    digest = hashlib.sha256()
+    for name in ("obs", "actions", "costs", "terminated", "truncated", "episode_ends"):
+        array = np.ascontiguousarray(getattr(demonstrations, name))
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def write(folder: Path, state: PyTree, identity: Identity | None) -> None:
     """Completes the step in `folder`, whose files hold `state`."""
     content = {
-        "config": None if config is None else _plain(dataclasses.asdict(config)),
+        "identity": None if identity is None else _plain(dataclasses.asdict(identity)),
         "versions": versions(),
         "device": jax.devices()[0].device_kind,
         "arrays": describe(state),
@@ -83,18 +124,33 @@ def read(folder: Path) -> dict[str, Any]:
     return content
 
 
-def check_config(folder: Path, manifest: Mapping[str, Any], config: Config | None, free: frozenset[str]) -> None:
-    """Raises `CheckpointError` where a field of `config`, except `free`, differs from the manifest's."""
-    saved = manifest["config"]
-    if config is None or saved is None:
+def check_identity(folder: Path, manifest: Mapping[str, Any], identity: Identity | None, free: frozenset[str]) -> None:
+    """Raises `CheckpointError` where `identity` is not the manifest's, but for the fields `free` of configurations."""
+    saved = manifest.get("identity") or _identity_of_older(manifest)
+    if identity is None or saved is None:
         return
-    now = _plain(dataclasses.asdict(config))
-    for name in sorted((saved.keys() | now.keys()) - free):
-        if saved.get(name) != now.get(name):
-            raise CheckpointError(
-                f"{folder}: written with {name} {saved.get(name)}, this run has {now.get(name)}; "
-                "continue with the configuration that it was written with, or begin a new run"
-            )
+    now = _plain(dataclasses.asdict(identity))
+    for name in sorted(now.keys() - {"configs"}):
+        if now[name] is not None and saved.get(name) is not None and saved[name] != now[name]:
+            raise _other(folder, name, saved[name], now[name])
+    if saved.get("num_seeds") is not None and len(saved["configs"]) != len(now["configs"]):
+        raise _other(folder, "number of configurations", len(saved["configs"]), len(now["configs"]))
+    for config, before, after in zip(identity.configs, saved["configs"], now["configs"], strict=False):
+        for name in sorted((before.keys() | after.keys()) - free - set(unused(config))):
+            if before.get(name) != after.get(name):
+                raise _other(folder, name, before.get(name), after.get(name))
+
+
+def _identity_of_older(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What a manifest of version 0.1.0 before identities says: its first configuration."""
+    return {"configs": [manifest["config"]]} if manifest.get("config") else None
+
+
+def _other(folder: Path, name: str, saved: Any, now: Any) -> CheckpointError:
+    return CheckpointError(
+        f"{folder}: written with {name} {saved}, this run has {now}; continue with what it was written with, or begin "
+        "a new run in another folder"
+    )
 
 
 def check_arrays(folder: Path, manifest: Mapping[str, Any], tree: PyTree) -> None:

@@ -1,6 +1,5 @@
 """Whole episodes of a fixed policy: evaluation, recording of demonstrations, and the random policy."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -8,11 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax.sharding import NamedSharding, PartitionSpec
 
 from ccil_jax import networks
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.program import run_mesh, usable_devices
 from ccil_jax.rollout import Actor, act
+from ccil_jax.types import PyTree
 from envs.base import Environment, State, full_precision
 
 
@@ -103,29 +105,45 @@ def evaluate(
     num_episodes: int = 50,
     seed: int = 0,
     deterministic: bool = False,
+    shared_episodes: bool = False,
 ) -> Evaluation:
     """Return, cost and length of `num_episodes` fresh episodes for every seed of `actor` ([S]-leading).
 
-    The policy acts stochastically, as it was trained, unless `deterministic`. All seeds see the same random numbers.
+    The policy acts stochastically, as it was trained, unless `deterministic`. Every seed draws starts, layouts and
+    noise of its own, so that the seeds' means are independent. With `shared_episodes` all draw the same, for paired
+    comparisons between policies. The seeds are spread over the local devices.
     """
+    num_seeds = len(jax.tree.leaves(actor)[0])
     key = jax.random.key(seed)
+    draws = jnp.zeros(num_seeds, jnp.uint32) if shared_episodes else jnp.arange(num_seeds, dtype=jnp.uint32)
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, draws)
 
-    @jax.jit
-    @functools.partial(jax.vmap, in_axes=(0, None))
-    def run(actor: Actor, key: jax.Array) -> Evaluation:
+    def run(runs: tuple[Actor, jax.Array]) -> Evaluation:
+        actor, key = runs
         return _totals(run_episodes(env, _learnt(config, env, actor, deterministic), num_episodes, key))
 
-    return jax.tree.map(np.asarray, run(actor, key))
+    return _spread(run, (actor, keys))
 
 
 def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) -> Evaluation:
     """The same for uniformly random actions; arrays are [1, num_episodes]."""
+    num_devices = len(usable_devices())
+    padded = -(-num_episodes // num_devices) * num_devices  # so that the devices share them evenly
 
-    @jax.jit
     def run(key: jax.Array) -> Evaluation:
-        return _totals(run_episodes(env, _uniform(env), num_episodes, key))
+        return _totals(run_episodes(env, _uniform(env), 1, key))
 
-    return jax.tree.map(lambda x: np.asarray(x)[None], run(jax.random.key(seed)))
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(padded, dtype=jnp.uint32))
+    return jax.tree.map(lambda rows: rows[:num_episodes].T, _spread(run, keys))
+
+
+def _spread(run: Callable[[Any], Evaluation], runs: PyTree) -> Evaluation:
+    """`run` of every row of `runs` ([R]-leading), the rows shared by the local devices, as NumPy arrays."""
+    mesh = run_mesh(len(jax.tree.leaves(runs)[0]))
+    by_run = PartitionSpec("runs")
+    shared = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=by_run, out_specs=by_run, check_vma=False)
+    placed = jax.device_put(runs, NamedSharding(mesh, by_run))
+    return jax.tree.map(np.asarray, jax.jit(shared)(placed))
 
 
 def record(

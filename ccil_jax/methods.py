@@ -1,29 +1,37 @@
-"""The methods: where the reward comes from, how the cost enters, and whose limit holds."""
+"""The methods, one row each: who learns, where the reward comes from, how the cost enters, and whose limit holds.
 
-from collections.abc import Callable, Mapping
+Importing this module imports no JAX. The names in a row are keys of the tables that hold the functions:
+`agents.AGENTS`, `reward_models.REWARD_MODELS` and `constraints.CONSTRAINTS`.
+"""
+
+from collections.abc import Mapping
 from typing import Literal, NamedTuple
-
-from ccil_jax import constraints
-from ccil_jax.config import Config
-from ccil_jax.constraints import Constraint
 
 
 class Method(NamedTuple):
-    """One row of the table."""
+    """One row of the table. None where the method has no such part."""
 
-    reward: Literal["discriminator", "task"]
-    constraint: Callable[[Config], Constraint]
-    limit: Literal["expert", "prescribed", "none"]  # "expert": the demonstrations' mean episode cost, J_E
+    agent: Literal["on_policy", "behavior_cloning", "iq_learn"] = "on_policy"
+    reward: Literal["discriminator", "task"] | None = None
+    constraint: str | None = None
+    limit: Literal["demonstrations", "prescribed"] | None = None  # the first is J_E, the demonstrations' mean cost
+
+    @property
+    def imitates(self) -> bool:
+        """Whether the method learns from demonstrations."""
+        return self.reward != "task"
 
 
 METHODS: Mapping[str, Method] = {
-    "malm": Method("discriminator", constraints.meta_lagrangian, "expert"),
-    "cvag": Method("discriminator", constraints.alternating, "expert"),
-    "ccil": Method("discriminator", constraints.lagrangian, "expert"),
-    "lgail": Method("discriminator", constraints.lagrangian, "prescribed"),
-    "cpo_il": Method("discriminator", constraints.trust_region_optimal, "expert"),
-    "pid_il": Method("discriminator", constraints.pid, "expert"),
-    "gail": Method("discriminator", constraints.unconstrained, "none"),
-    "trpo": Method("task", constraints.unconstrained, "none"),
-    "expert": Method("task", constraints.lagrangian, "prescribed"),
+    "malm": Method(reward="discriminator", constraint="meta_lagrangian", limit="demonstrations"),
+    "cvag": Method(reward="discriminator", constraint="alternating", limit="demonstrations"),
+    "ccil": Method(reward="discriminator", constraint="lagrangian", limit="demonstrations"),
+    "lgail": Method(reward="discriminator", constraint="lagrangian", limit="prescribed"),
+    "gail": Method(reward="discriminator", constraint="unconstrained"),
+    "cpo_il": Method(reward="discriminator", constraint="trust_region_optimal", limit="demonstrations"),
+    "pid_il": Method(reward="discriminator", constraint="pid", limit="demonstrations"),
+    "bc": Method(agent="behavior_cloning"),
+    "iq_learn": Method(agent="iq_learn"),
+    "trpo": Method(reward="task", constraint="unconstrained"),
+    "expert": Method(reward="task", constraint="lagrangian", limit="prescribed"),
 }

@@ -1,4 +1,4 @@
-"""The on-policy agent: Algorithms 1 and 2 of the paper as one iteration, for every row of `methods.METHODS`."""
+"""The on-policy agent: Algorithms 1 and 2 of the paper as one iteration, for the rows of `methods.METHODS` with it."""
 
 import dataclasses
 from collections.abc import Callable
@@ -9,11 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from ccil_jax import distributions, networks, policy_step, regression, reward_models, rollout, running_statistics
+from ccil_jax import (
+    constraints,
+    distributions,
+    networks,
+    policy_step,
+    regression,
+    reward_models,
+    rollout,
+    running_statistics,
+)
 from ccil_jax.config import Config
 from ccil_jax.constraints import Constraint, Episodes
 from ccil_jax.distributions import Gaussian
-from ccil_jax.methods import METHODS
 from ccil_jax.policy_step import PolicyStep
 from ccil_jax.regression import Critic
 from ccil_jax.returns import gae, successor_values
@@ -56,25 +64,28 @@ class AgentState:
     key: jax.Array
 
 
+LastBatch = tuple[Transition, PolicyStep, jax.Array]  # of an iteration; the last is the order of its samples
+
+
 def initial_std(env: Environment) -> np.ndarray:
     """1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped."""
     return np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
 
 
 def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
-    """Builds the agent of `config.method`. `config.cost_limit` must be set; `expert` is None for task rewards."""
-    method = METHODS[config.method]
-    constraint = method.constraint(config)
+    """Builds the agent of `config.method`. `config` must be resolved; `expert` is None for task rewards."""
+    constraint = constraints.make(config)
     policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
     critic = networks.make_scalar(config, env.obs_dim)
-    if method.reward == "discriminator":
+    if config.row.reward == "discriminator":
         assert expert is not None, f"{config.method} learns from demonstrations"
         # A small last layer: an untrained discriminator must not reward anything in particular.
         network = networks.make_scalar(config, env.obs_dim + env.action_dim, final_scale=0.01)
         reward_model = reward_models.discriminator(config, network, expert, env.obs_dim)
     else:
         reward_model = reward_models.task()
-    limit = jnp.asarray(config.cost_limit, jnp.result_type(float))
+    # A method without a limit has none to look at: the number enters nothing.
+    limit = jnp.asarray(0.0 if config.cost_limit is None else config.cost_limit, jnp.result_type(float))
 
     def init(key: jax.Array) -> AgentState:
         key, policy_key, critic_key, reward_key, env_key = jax.random.split(key, 5)
@@ -92,9 +103,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             key=key,
         )
 
-    def generator_step(
-        state: AgentState, key: jax.Array
-    ) -> tuple[AgentState, tuple[Transition, PolicyStep, jax.Array, Metrics]]:
+    def generator_step(state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
         rollout_key, split_key, critic_key = jax.random.split(key, 3)
         rollout_state, transition = rollout.rollout(
             env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
@@ -129,7 +138,12 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             rollout=rollout_state,
             estimates=estimates,
         )
-        return new, (transition, taken, order, metrics)
+        return new, (transition, taken, order), metrics
+
+    def keep_last(carry: tuple[AgentState, LastBatch], key: jax.Array) -> tuple[tuple[AgentState, LastBatch], Metrics]:
+        """A generator step of the scan: only the last batch is wanted afterwards, so no other is kept."""
+        state, last, metrics = generator_step(carry[0], key)
+        return (state, last), metrics
 
     def reassess(state: AgentState, reward_state: PyTree, transition: Transition, order: jax.Array) -> Batch:
         """The held-out samples of the last batch, with advantages by the updated critics and reward model."""
@@ -142,9 +156,9 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, generator_key, reward_key = jax.random.split(state.key, 3)
         generator_keys = jax.random.split(generator_key, config.generator_steps)
-        state, outputs = jax.lax.scan(generator_step, state, generator_keys)
-        transition, taken, order, _ = jax.tree.map(lambda x: x[-1], outputs)
-        generator_metrics = outputs[3]
+        (state, (transition, taken, order)), generator_metrics = jax.lax.scan(
+            keep_last, (state, _blank(generator_step, state, generator_keys[0])), generator_keys
+        )
 
         reward_state, reward_metrics = reward_model.update(state.reward_model, transition, reward_key)
         if config.num_held_out and config.outer_advantage == "re-evaluated":
@@ -175,6 +189,16 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
         return new, metrics | reward_metrics | constraint_metrics
 
     return Agent(init, step)
+
+
+def _blank(
+    generator_step: Callable[[AgentState, jax.Array], tuple[AgentState, LastBatch, Metrics]],
+    state: AgentState,
+    key: jax.Array,
+) -> LastBatch:
+    """Zeros in the place of a batch before the first generator step."""
+    batch = jax.eval_shape(generator_step, state, key)[1]
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), batch)
 
 
 def estimate_episodes(previous: EpisodeEstimates, transition: Transition) -> tuple[EpisodeEstimates, jax.Array]:

@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import jax
@@ -12,9 +12,9 @@ import numpy as np
 
 from ccil_jax import files, guard, iq_learn
 from ccil_jax.checkpointing import Checkpointer
-from ccil_jax.config import IMITATION_METHODS, PRESCRIBED_LIMIT_METHODS, Config, ConfigError, field_names, validate
+from ccil_jax.config import Config, ConfigError, field_names, validate, with_limit_of
 from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.digests import CheckpointError
+from ccil_jax.digests import CheckpointError, Identity, identity_of
 from ccil_jax.guard import GuardedState
 from ccil_jax.program import Program, compile_program, make_agent
 from ccil_jax.rollout import Actor
@@ -25,6 +25,8 @@ CHECKPOINT_SECONDS = 60.0  # about this much work is lost with a killed process
 SAVING_SHARE = 0.02  # of the time: large states are saved less often
 CHUNK_SECONDS = 1.0  # between two looks from Python, unless one iteration takes longer
 
+EPISODE_ESTIMATES = ("episode_return", "episode_cost", "episode_length")  # metrics of whole episodes
+
 History = dict[str, np.ndarray]
 
 
@@ -34,7 +36,7 @@ class Progress:
 
     iteration: int  # finished so far
     num_iterations: int
-    metrics: History  # the new rows, [chunk, num_runs] each
+    metrics: History  # the new rows, [chunk, num_runs] each; NaN for what is not known yet
     env_steps_per_second: float  # of this chunk, all runs together
     compile_seconds: float
     stopped: np.ndarray  # [num_seeds] bool: seeds given up, after too many iterations in a row that were not finite
@@ -44,8 +46,9 @@ class Progress:
 class Result:
     """A finished (or stopped) run."""
 
-    config: Config  # as resolved: cost_limit is set
-    metrics: History  # [iterations, num_seeds] each
+    config: Config  # as resolved: the demonstrations' cost limit is set
+    identity: Identity  # of this configuration's runs
+    metrics: History  # [iterations, num_seeds] each; {} before the first
     state: GuardedState  # [num_seeds]-leading
     env_steps: int  # per seed
     compile_seconds: float
@@ -68,7 +71,8 @@ class Loaded:
 
 def resolve(config: Config, env: Environment, demonstrations: Demonstrations | None) -> Config:
     """Checks that the pieces fit and sets the cost limit. Raises `ConfigError` before anything is compiled."""
-    if config.method in IMITATION_METHODS:
+    validate(config)
+    if config.row.imitates:
         if demonstrations is None:
             raise ConfigError(f"method {config.method} needs demonstrations; pass some, or use method trpo or expert")
         for name, array, size in (
@@ -77,10 +81,8 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         ):
             if array.shape[1] != size:
                 raise ConfigError(f"demonstrations: {name} has {array.shape[1]} columns but {env.name} has {size}")
-    if config.method in IMITATION_METHODS - PRESCRIBED_LIMIT_METHODS and demonstrations is not None:
-        config = config.replace(cost_limit=float(demonstrations.mean_episode_cost))
-    elif config.cost_limit is None and config.method not in PRESCRIBED_LIMIT_METHODS:
-        config = config.replace(cost_limit=0.0)  # enters nothing
+    if demonstrations is not None:
+        config = with_limit_of(config, demonstrations.mean_episode_cost)
     if (
         config.method == "iq_learn"
         and demonstrations is not None
@@ -92,7 +94,6 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         )
     if config.method == "iq_learn" and config.temperature is None:
         config = config.replace(temperature=iq_learn.TEMPERATURES.get(env.name, iq_learn.USUAL_TEMPERATURE))
-    validate(config)
     return config
 
 
@@ -136,6 +137,7 @@ def train(
     one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
+    moved: Collection[str] = (),
     on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -152,15 +154,17 @@ def train(
         one_by_one: each device takes its seeds in turn. Then a seed's bits depend neither on how many seeds there are
             nor on how many devices.
         checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
-        resume: continue from the newest intact checkpoint in `checkpoint_dir`.
+        resume: continue from the newest intact checkpoint in `checkpoint_dir`, of the same training; begin where there
+            is none. Without it, a folder with checkpoints is refused.
+        moved: names of traced fields that may differ from those of the training that is resumed.
         on_start: called once, before the first iteration, with the metrics of those that are done ({} if none is).
         on_progress: called after every chunk of iterations.
         should_stop: asked after every chunk; once true, the state is saved and the result so far is returned.
-        stop_after: stop once this many iterations are done, to be resumed later.
+        stop_after: stop once this many iterations are done, to be resumed later; 0 takes no step at all.
 
     Raises:
         ConfigError: options, environment and demonstrations do not fit together; or the checkpoints are damaged, those
-            of another configuration, in use by another process, or cannot be written.
+            of another training, in use by another process, or cannot be written.
     """
     return train_runs(
         [config],
@@ -171,6 +175,7 @@ def train(
         one_by_one=one_by_one,
         checkpoint_dir=checkpoint_dir,
         resume=resume,
+        moved=moved,
         on_start=on_start,
         on_progress=on_progress,
         should_stop=should_stop,
@@ -188,6 +193,7 @@ def train_runs(
     one_by_one: bool = False,
     checkpoint_dir: Path | None = None,
     resume: bool = False,
+    moved: Collection[str] = (),
     on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -204,22 +210,32 @@ def train_runs(
     start = time.perf_counter()
     if num_seeds < 1:
         raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
+    if stop_after is not None and stop_after < 0:
+        raise ConfigError(f"stop_after {stop_after}: must be at least 0")
+    if static := set(moved) - set(field_names(traced=True)):
+        raise ConfigError(f"moved {min(static)}: only a traced field may differ from the training that is resumed")
     configs = [resolve(config, env, demonstrations) for config in configs]
     config, varied = join(configs, num_seeds)
     num_runs = len(configs) * num_seeds
-    last = min(stop_after or config.num_iterations, config.num_iterations)
+    last = config.num_iterations if stop_after is None else min(stop_after, config.num_iterations)
+    identity = identity_of(configs, env, demonstrations, num_seeds, seed)
 
     with contextlib.ExitStack() as stack:
         checkpoints = None
         if checkpoint_dir:
             stack.enter_context(files.hold(checkpoint_dir / ".writer.lock"))
-            checkpoints = stack.enter_context(Checkpointer(checkpoint_dir, config))
-        found = checkpoints.latest_step() if checkpoints and resume else None
+            checkpoints = stack.enter_context(Checkpointer(checkpoint_dir, identity, free=frozenset(moved)))
+            if not resume:
+                checkpoints.check_empty()
+        found = checkpoints.latest_step() if checkpoints else None
+        if checkpoints and found:
+            checkpoints.check_identity(found)  # compiling takes longer
         program = compile_program(
             config, env, expert_data(demonstrations), num_runs, varied=varied, one_by_one=one_by_one
         )
         if checkpoints and found:
             done, (state, history) = found, _restore(checkpoints, found, program)
+            history = _without_unknown(history)
         else:
             keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
             done, state, history = 0, program.init(keys), {}
@@ -236,6 +252,8 @@ def train_runs(
             stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
             elapsed = time.perf_counter() - chunk_start
             history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
+            history = _without_unknown(history)
+            rows = {name: values[-length:] for name, values in history.items()}
             done += length
             stop = done >= last or bool(stopped.all()) or (should_stop is not None and should_stop())
             due = time.perf_counter() - saved_at > max(CHECKPOINT_SECONDS, saving / SAVING_SHARE)
@@ -261,6 +279,7 @@ def train_runs(
     return [
         Result(
             config=config,
+            identity=dataclasses.replace(identity, configs=(config,)),
             metrics={name: rows[:, own] for name, rows in history.items()},
             state=jax.tree.map(lambda leaf, own=own: leaf[own], state) if len(configs) > 1 else state,
             env_steps=done * config.steps_per_iteration,
@@ -297,9 +316,12 @@ def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, j
 
 
 def save(result: Result, directory: Path) -> None:
-    """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs."""
-    with Checkpointer(directory, result.config) as checkpoints:
-        checkpoints.save(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
+    """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs.
+
+    What another training has left in `directory` is set aside.
+    """
+    with Checkpointer(directory, result.identity) as checkpoints:
+        checkpoints.replace(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
 
 
 def _restore(checkpoints: Checkpointer, step: int, program: Program) -> tuple[GuardedState, History]:
@@ -312,7 +334,7 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     """The policies of the newest checkpoint in `checkpoint_dir`. Demonstrations are not needed.
 
     Raises:
-        CheckpointError: there is no intact checkpoint, or it is another configuration's.
+        CheckpointError: there is no intact checkpoint, or it is another training's.
     """
     config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
     obs, action = jnp.zeros((1, env.obs_dim)), jnp.zeros((1, env.action_dim))
@@ -330,14 +352,28 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
         jax.eval_shape(init, jax.random.key(0)),
     )
     # The limit as resolved is not known without the demonstrations; the temperature does not matter for acting.
+    identity = Identity(configs=(config,), num_seeds=num_seeds)
     with Checkpointer(
-        checkpoint_dir, config, free=frozenset({"cost_limit", "temperature"}), readonly=True
+        checkpoint_dir, identity, free=frozenset({"cost_limit", "temperature"}), readonly=True
     ) as checkpoints:
         step = checkpoints.latest_step()
         if step is None:
             raise CheckpointError(f"{checkpoint_dir}: holds no finished checkpoint; train first, or continue the run")
         saved = checkpoints.restore(step, {"state": like, "history": checkpoints.structure(step)["history"]})
     return Loaded(config=config, agent=saved["state"].actor)
+
+
+def _without_unknown(history: History) -> History:
+    """The metrics, with NaN for a seed's return, cost and length of episodes before its first episode has ended.
+
+    The learner's own estimates then stand at a start value, which nobody has measured. An iteration that was taken back
+    ends no episode.
+    """
+    if "episodes_finished" not in history:
+        return history
+    taken_back = np.diff(history["skipped_updates"], axis=0, prepend=0) > 0
+    known = np.cumsum(np.where(taken_back, 0, history["episodes_finished"]), axis=0) > 0
+    return history | {name: np.where(known, history[name], np.nan) for name in EPISODE_ESTIMATES}
 
 
 def _rows(metrics: History, done: int, config: Config) -> History:

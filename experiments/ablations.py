@@ -7,12 +7,14 @@ preset `paper` has, from which all start unless another is given.
 
 import argparse
 import dataclasses
+import functools
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import PRESETS, Config
+from ccil_jax.config import PRESETS, Config, check_used, unused
+from ccil_jax.demonstrations import load_demonstrations
 from experiments import command_line, comparison, options, study, train
 from experiments.command_line import Parser, UsageError
 from experiments.comparison import Row
@@ -30,6 +32,12 @@ class Question:
 
 def _one_field(text: str, field: str, values: Sequence[Any], method: str = "malm") -> Question:
     return Question(text, method, {str(value): {field: value} for value in values})
+
+
+def _preset(name: str, method: str) -> dict[str, Any]:
+    """What a preset says of the fields that the method uses."""
+    idle = unused(Config.from_preset(name, method=method))
+    return {field: value for field, value in PRESETS[name].items() if field not in idle}
 
 
 QUESTIONS: Mapping[str, Question] = {
@@ -60,7 +68,7 @@ QUESTIONS: Mapping[str, Question] = {
     "preset": Question(
         "The algorithm as printed, or as its authors coded it?",
         "malm",
-        {"paper": {}, **{name: PRESETS[name] for name in ("printed", "authors")}},
+        {name: _preset(name, "malm") for name in ("paper", "printed", "authors")},
     ),
     "outer_advantage": _one_field(
         "Whose advantages judge the outer step?", "outer_advantage", ("stale", "re-evaluated")
@@ -113,17 +121,30 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
     """The variant behind each (question, answer); the same variant where two answers come to the same `Config`."""
     found: dict[str, Variant] = {}
     answers = {}
-    for name in names:
+    fields = {"preset": "paper", **shared}
+    chosen = [(name, answer) for name in names for answer in QUESTIONS[name].answers]
+    configs = {key: _config(fields, QUESTIONS[key[0]].answers[key[1]], QUESTIONS[key[0]].method) for key in chosen}
+    idle = {key: set(unused(config)) for key, config in configs.items()}
+    check_used(configs[chosen[0]], shared.keys() & set.intersection(*idle.values()))
+    load = functools.cache(load_demonstrations)
+    for name, answer in chosen:
         question = QUESTIONS[name]
-        fields = {"preset": "paper", **shared, "method": question.method}
-        plain = options.config_from({**options.DEFAULTS, **fields}, fields["preset"])
-        for i, (answer, changes) in enumerate(question.answers.items()):
-            folder = _name(plain, changes)
-            baseline = i == 0
-            if folder not in found or (baseline and not found[folder].alone):
-                found[folder] = make_variant(folder, {**fields, **changes}, out, alone=baseline)
-            answers[name, answer] = found[folder]
+        plain, changes = _config(fields, {}, question.method), question.answers[answer]
+        folder = _name(plain, changes)
+        baseline = answer == next(iter(question.answers))
+        if folder not in found or (baseline and not found[folder].alone):
+            # What all variants share may make no difference to some of them.
+            own = {field: value for field, value in fields.items() if field not in idle[name, answer]}
+            options_of_variant = {**own, "method": question.method, **changes}
+            found[folder] = make_variant(folder, options_of_variant, out, load=load, alone=baseline)
+        answers[name, answer] = found[folder]
     return {key: found[variant.name] for key, variant in answers.items()}
+
+
+def _config(fields: Mapping[str, Any], changes: Mapping[str, Any], method: str) -> Config:
+    """The configuration of an answer; what makes no difference to it is left at its default."""
+    given = {name: value for name, value in fields.items() if name in options.CONFIG_FIELDS}
+    return Config.from_base({**PRESETS[fields["preset"]], **given, **changes, "method": method}, {})
 
 
 def _name(plain: Config, changes: Mapping[str, Any]) -> str:

@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import METHOD_NAMES, PRESETS, Config
+from ccil_jax.config import CHOICES, PRESETS, Config
 from ccil_jax.versions import versions
 from envs.registry import PHYSICS
 from experiments import command_line, devices, interruption, options, peers, run_folder, workers
@@ -42,7 +42,7 @@ def make_parser() -> Parser:
         metavar="N",
         help="per seed; one row for each (default: 16)",
     )
-    parser.add_argument("--method", default="malm", choices=METHOD_NAMES, help="what is trained (default: malm)")
+    parser.add_argument("--method", default="malm", choices=CHOICES["method"], help="what is trained (default: malm)")
     parser.add_argument(
         "--physics", nargs="+", default=["auto"], choices=PHYSICS, help="engines; one row for each (default: auto)"
     )

@@ -8,7 +8,7 @@ the preset `expert`, those of Safety Gym tasks from `safety_gym_expert`.
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,16 @@ from experiments.training import Outcome, Plan, execute
 
 PRESETS = {"locomotion": "expert", "safety_gym": "safety_gym_expert"}  # of each family
 DEFAULTS = {**options.DEFAULTS, "preset": PRESETS["locomotion"]}
+# What --resume may change: an expert that misses its limit goes on under another one, or with a stronger multiplier.
+MOVABLE = (
+    "cost_limit",
+    "multiplier_learning_rate",
+    "multiplier_max",
+    "pid_proportional_gain",
+    "pid_integral_gain",
+    "pid_derivative_gain",
+    "pid_smoothing",
+)
 
 
 def make_parser() -> Parser:
@@ -40,7 +50,7 @@ def make_parser() -> Parser:
         "--run-dir", type=Path, metavar="DIR", help="run folder of the training (default: runs/<task>_<method>_<time>)"
     )
     parser.add_argument("--resume", action="store_true", help="continue the run in --run-dir from its last checkpoint")
-    options.add_config_options(parser, DEFAULTS["preset"], hide=("method",))
+    options.add_config_options(parser, DEFAULTS["preset"], methods=("expert", "trpo"))
     return parser
 
 
@@ -55,14 +65,12 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         raise UsageError(f"--out {arguments.out}: a demonstrations file is named *.npz")
     if arguments.out.exists() and not arguments.overwrite:
         raise UsageError(f"--out {arguments.out}: exists; choose another name or add --overwrite")
-    if arguments.resume:
-        given = resumed(arguments.run_dir, given, "--run-dir")
-    choices = {**DEFAULTS, "env": None, **given}
+    saved = _resumed(arguments.run_dir, given) if arguments.resume else {}
+    choices = {**DEFAULTS, "env": None, **saved, **given}
     task = options.find_task(choices["env"])
-    if not arguments.unconstrained:
-        choices.setdefault("cost_limit", task.cost_limit)
-    preset = given.get("preset", PRESETS[task.family])
-    config = options.config_from(choices, preset)
+    limit = {} if arguments.unconstrained or "cost_limit" in choices else {"cost_limit": task.cost_limit}
+    preset = {**saved, **given}.get("preset", PRESETS[task.family])
+    config = options.config_from({**given, **limit}, preset, saved)
     folder = arguments.run_dir or command_line.default_folder(task.name, method)
     command_line.check_writable(arguments.out.parent, "--out")
     command_line.check_output_folder(folder, resume=arguments.resume, option="--run-dir")
@@ -81,7 +89,17 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         resume=arguments.resume,
         eval_episodes=choices["eval_episodes"],
         command=command_line.command(),
+        moved=tuple(name for name in MOVABLE if arguments.resume and name in given),
     )
+
+
+def _resumed(folder: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The choices of the run in `folder`. Raises `UsageError` where `given` disagrees and may not."""
+    saved = resumed(folder, {k: v for k, v in given.items() if k != "method"}, "--run-dir", MOVABLE)
+    if saved["method"] != given["method"]:
+        with_limit = "leave --unconstrained out" if given["method"] == "trpo" else "add --unconstrained"
+        raise UsageError(f"--resume: the run in {folder} is of method {saved['method']}; {with_limit} to resume it")
+    return saved
 
 
 def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int | None:

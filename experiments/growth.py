@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ccil_jax.config import METHOD_NAMES
+from ccil_jax.config import CHOICES
 from experiments import benchmark, command_line, options, run_folder
 from experiments.command_line import Parser
 from experiments.summary import show
@@ -36,7 +36,7 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("growth", __doc__ or "")
     parser.add_argument("--env", default="HalfCheetah", metavar="TASK", help="task (default: HalfCheetah)")
-    parser.add_argument("--method", default="malm", choices=METHOD_NAMES, help="what is trained (default: malm)")
+    parser.add_argument("--method", default="malm", choices=CHOICES["method"], help="what is trained (default: malm)")
     parser.add_argument("--axes", nargs="+", choices=tuple(AXES), default=tuple(AXES), metavar="AXIS", help="of them")
     parser.add_argument("--largest", type=command_line.positive, metavar="N", help="leave out points beyond N")
     parser.add_argument("--out", type=Path, default=Path("growth"), metavar="DIR", help="new folder (default: growth)")

@@ -14,10 +14,9 @@ import numpy as np
 from mujoco.batch import Batch as RawBatch
 
 import envs
-from ccil_jax import networks, policy_step, program, rollout, runner, running_statistics
+from ccil_jax import constraints, networks, policy_step, program, rollout, runner, running_statistics
 from ccil_jax.config import PRESETS, Config
 from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.methods import METHODS
 from ccil_jax.types import Batch
 from envs.base import full_precision
 from experiments.turns import turn
@@ -69,7 +68,7 @@ def make_config(setting: Setting) -> Config:
     """Of the training that is measured: two iterations, which make a chunk, or a single long one."""
     changes = {name: tuple(value) if isinstance(value, list) else value for name, value in setting.changes.items()}
     chosen = {"method": setting.method, "num_envs": setting.num_envs}
-    config = Config(**{**PRESETS[setting.preset], **changes, **chosen})
+    config = Config.from_base({**PRESETS[setting.preset], **changes}, chosen)
     num_iterations = 2 if setting.num_seeds * config.steps_per_iteration < _LONG else 1
     return config.replace(env_steps=num_iterations * config.steps_per_iteration)
 
@@ -235,7 +234,7 @@ def training_work(config: Config, env: Any, setting: Setting) -> tuple[Work, flo
 def _policy_steps(config: Config, env: Any, setting: Setting) -> tuple[Work, Work]:
     """One plain policy step and one outer step (dual step and meta-gradient) of malm, all seeds side by side."""
     config = config.replace(method="malm", cost_limit=0.0)
-    constraint = METHODS["malm"].constraint(config)
+    constraint = constraints.make(config)
     policy = networks.make_policy(config, env.obs_dim, env.action_dim)
 
     def samples(key: jax.Array) -> tuple[Any, Batch, Batch]:

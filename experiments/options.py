@@ -6,9 +6,11 @@ import difflib
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
-from ccil_jax.config import CHOICES, PRESETS, Config, ConfigError, validate
+from ccil_jax.config import CHOICES, PRESETS, Config, ConfigError, Use, validate
+from ccil_jax.methods import METHODS
 from envs.registry import PHYSICS, TASKS, TaskInfo
 from experiments.command_line import Parser, UsageError, boolean, integer, natural, positive
 
@@ -58,34 +60,44 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
     add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
 
 
-def add_config_options(parser: Parser, preset: str, *, hide: Sequence[str] = ()) -> None:
-    """One option per `Config` field, except `hide`; `--help` shows the preset's values.
+def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = tuple(METHODS)) -> None:
+    """One option per `Config` field but the method, grouped by who uses them; `--help` shows the preset's values.
 
-    What is not given is absent from the parsed arguments.
+    A field that none of `methods` uses is left out of `--help`; given all the same, it is refused with the reason. What
+    is not given is absent from the parsed arguments.
     """
-    static = parser.add_argument_group("hyperparameters that shape the program (a change compiles anew)")
-    traced = parser.add_argument_group("hyperparameters inside the program")
+    groups: dict[Use, Any] = {}
     defaults = Config(**PRESETS[preset])
     for field in dataclasses.fields(Config):
-        if field.name in hide:
+        if field.name == "method":
             continue
+        use: Use = field.metadata["use"]
+        if use not in groups:
+            groups[use] = parser.add_argument_group(f"hyperparameters of {use.who}")
         choices = f"; one of {', '.join(CHOICES[field.name])}" if field.name in CHOICES else ""
         value = getattr(defaults, field.name)
         default = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-        (traced if field.metadata["traced"] else static).add_argument(
+        again = "" if field.metadata["traced"] else "; a change compiles the program anew"
+        text = f"{field.metadata['help']}{choices} (default: {default.lower()}{again})".replace("%", "%%")
+        groups[use].add_argument(
             "--" + field.name.replace("_", "-"),
             dest=field.name,
             type=_parser_of(field.type),
             default=argparse.SUPPRESS,
             metavar="X",
-            help=f"{field.metadata['help']}{choices} (default: {default.lower()})".replace("%", "%%"),
+            help=text if not set(use.methods).isdisjoint(methods) else argparse.SUPPRESS,
         )
 
 
-def config_from(given: Mapping[str, Any], preset: str) -> Config:
-    """The preset with the given options on top, validated. Raises `ConfigError`."""
-    config = Config(**{**PRESETS[preset], **{k: v for k, v in given.items() if k in CONFIG_FIELDS}})
+def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] = MappingProxyType({})) -> Config:
+    """The preset, then what a run that is resumed has `saved`, then the options given, validated.
+
+    Raises:
+        ConfigError: also for an option given that makes no difference to the run.
+    """
+    base, changes = ({k: v for k, v in fields.items() if k in CONFIG_FIELDS} for fields in (saved, given))
     try:
+        config = Config.from_base({**PRESETS[preset], **base}, changes)
         validate(config)
     except ConfigError as error:
         raise ConfigError(_with_hyphens(str(error))) from None

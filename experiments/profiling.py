@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from ccil_jax import networks, on_policy, policy_step, reward_models, rollout, runner
-from ccil_jax.methods import METHODS
+from ccil_jax import constraints, networks, on_policy, policy_step, reward_models, rollout, runner
 from experiments.measuring import Setting, Work, make_config, noise, physics_work, rate_of, spread, training_work, wait
 
 
@@ -22,12 +21,12 @@ def profile(setting: Setting) -> dict[str, Any]:
     demonstrations = noise(env, setting)
     config = runner.resolve(make_config(setting), env, demonstrations)
     expert = runner.expert_data(demonstrations)
-    method, num_seeds = METHODS[config.method], setting.num_seeds
-    constraint = method.constraint(config)
+    num_seeds = setting.num_seeds
+    constraint = constraints.make(config)
     policy = networks.make_policy(config, env.obs_dim, env.action_dim, on_policy.initial_std(env))
     critic = networks.make_scalar(config, env.obs_dim)
     reward_model = reward_models.task()
-    if method.reward == "discriminator":
+    if config.row.reward == "discriminator":
         assert expert is not None
         network = networks.make_scalar(config, env.obs_dim + env.action_dim, final_scale=0.01)
         reward_model = reward_models.discriminator(config, network, expert, env.obs_dim)

@@ -1,18 +1,21 @@
 """What `--resume` needs to know: the choices of the run in a folder, and that the options given agree with them."""
 
-import dataclasses
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+from ccil_jax.config import relevant
 from ccil_jax.files import file_sha256
 from experiments import options, run_folder
 from experiments.command_line import UsageError
 
 
-def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -> dict[str, Any]:
+def resumed(
+    folder: Path | None, given: Mapping[str, Any], option: str = "--out", movable: Collection[str] = ()
+) -> dict[str, Any]:
     """The choices of the run in `folder`, with `demos` as a path. Raises `UsageError` where `given` disagrees.
 
-    Only `env_steps` may differ, upwards: a finished run can be trained for longer.
+    `env_steps` may differ, upwards, as a finished run can be trained for longer, and so may the fields `movable`.
     """
     if folder is None:
         raise UsageError(f"--resume: needs {option} with the folder of the run to continue")
@@ -21,7 +24,7 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
     run = run_folder.read_run(folder)
     demos = run.facts["demonstrations"]
     saved = {
-        **dataclasses.asdict(run.config),
+        **relevant(run.config),
         **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
         "one_by_one": run.facts.get("one_by_one", False),  # older runs do not say
         **dict.fromkeys(options.TASK_OPTIONS),  # where the task has none; else:
@@ -30,8 +33,10 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
         "num_demos": demos["num_episodes"] if demos else None,
     }
     for name, value in given.items():
+        if name in ("demos", *movable) or name not in saved:  # what makes no difference to the run is refused later
+            continue
         longer = name == "env_steps" and value > saved[name]
-        if name != "demos" and value != saved[name] and not longer:
+        if value != saved[name] and not longer:
             raise UsageError(
                 f"--{name.replace('_', '-')} {value}: the run in {folder} has {saved[name]}; leave it out to resume"
             )
@@ -39,4 +44,4 @@ def resumed(folder: Path | None, given: dict[str, Any], option: str = "--out") -
     path: Path | None = given.get("demos", Path(demos["file"]) if demos else None)
     if path and path.is_file() and demos and file_sha256(path) != demos["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")
-    return {**saved, "env_steps": given.get("env_steps", saved["env_steps"]), "demos": path}
+    return {**saved, "demos": path}

@@ -59,13 +59,18 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
     """
     out: Path = arguments.out
     workers.check_launcher(arguments.launcher)
+    if arguments.slurm and arguments.launcher != "slurm":
+        raise UsageError(
+            f"--slurm: --launcher {arguments.launcher} does not use it; leave it out, or add --launcher slurm"
+        )
     command_line.check_output_folder(out, resume=arguments.resume, record=record)
     if arguments.resume:
         _check_choices(out / record, choices)
     for variant in chosen:
         variants.check_unchanged(variant)
     all_programs = variants.group(chosen, out)
-    programs = variants.group([variant for variant in chosen if not variant.finished], out)
+    # A program keeps its variants, so that what is missing goes on from the checkpoints that hold them all.
+    programs = [program for program in all_programs if not all(variant.finished for variant in program.variants)]
     num_runs = sum(variant.plan.num_seeds for variant in chosen)
     done = f", {len(programs)} of them unfinished" if arguments.resume else ""
     print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_programs)} programs{done}", flush=True)

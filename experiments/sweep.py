@@ -19,19 +19,20 @@ a worker that dies is replaced once. What is finished stays finished: an interru
 """
 
 import argparse
+import functools
 import itertools
 import json
 import sys
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import ConfigError
-from ccil_jax.demonstrations import DemonstrationsError
+from ccil_jax.demonstrations import DemonstrationsError, load_demonstrations
 from experiments import command_line, comparison, study
 from experiments.command_line import Parser, UsageError
-from experiments.variants import Variant, make_variant, text
+from experiments.variants import Variant, make_variant, run_of, text
 
 _KEYS = ("env", "method", "fixed", "grid")
 _LONGEST_NAME = 120  # of a folder
@@ -97,14 +98,22 @@ def points(grid: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
 def variants_of(path: Path, spec: Mapping[str, Any], out: Path) -> dict[str, tuple[Variant, dict[str, Any]]]:
     """The variants by name, each with its point of the grid. Raises `UsageError` that names the spec."""
     common = {key: spec[key] for key in ("env", "method") if key in spec} | spec["fixed"]
-    found = {}
+    load = functools.cache(load_demonstrations)
+    found: dict[str, tuple[Variant, dict[str, Any]]] = {}
+    names: dict[Hashable, str] = {}
     for i, point in enumerate(points(spec["grid"])):
         name = ",".join(f"{field}={text(value)}" for field, value in point.items()).replace("/", "_")
         name = name if len(name) <= _LONGEST_NAME else f"variant_{i}"
         try:
-            found[name] = make_variant(name, {**common, **point}, out), point
+            variant = make_variant(name, {**common, **point}, out, load=load)
         except (UsageError, ConfigError, DemonstrationsError) as error:
             raise UsageError(f"SPEC {path}: {error}") from None
+        if name in found:
+            raise UsageError(f"SPEC {path}: grid: two points would share the folder {name}; rename what differs")
+        if (run := run_of(variant)) in names:
+            raise UsageError(f"SPEC {path}: grid: {name} is the same run as {names[run]}; leave one of them out")
+        found[name] = variant, point
+        names[run] = name
     return found
 
 

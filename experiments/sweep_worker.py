@@ -30,7 +30,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.cpus and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, arguments.cpus)
     program = variants.read_program(arguments.program)
-    execute_together([variant.plan for variant in program.variants], program.folder / "checkpoints")
+    finished = {variant.plan.folder for variant in program.variants if variant.finished}
+    plans = [variant.plan for variant in program.variants]
+    execute_together(plans, program.folder / "checkpoints", resume=True, finished=finished)
 
 
 def _cpus(text: str) -> list[int]:

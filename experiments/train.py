@@ -2,13 +2,15 @@
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
-from ccil_jax.config import IMITATION_METHODS, METHOD_NAMES, Config
+from ccil_jax.config import Config, with_limit_of
 from ccil_jax.demonstrations import Demonstrations, check_matches, load_demonstrations
+from ccil_jax.methods import METHODS
 from envs.registry import TaskInfo
 from experiments import command_line, options
 from experiments.command_line import Parser, UsageError
@@ -29,7 +31,7 @@ def add_options(parser: Parser, *, with_method: bool = True) -> None:
     """What a run is: all but where it goes."""
     absent = argparse.SUPPRESS
     if with_method:
-        parser.add_argument("--method", default=absent, metavar="NAME", help=f"one of {', '.join(METHOD_NAMES)}")
+        parser.add_argument("--method", default=absent, metavar="NAME", help=f"one of {', '.join(METHODS)}")
     options.add_run_options(parser)
     parser.add_argument(
         "--demos", default=absent, type=Path, metavar="FILE", help="demonstrations (default: those shipped for --env)"
@@ -37,29 +39,46 @@ def add_options(parser: Parser, *, with_method: bool = True) -> None:
     parser.add_argument(
         "--num-demos", default=absent, type=command_line.positive, metavar="K", help="use the first K trajectories only"
     )
-    options.add_config_options(parser, options.DEFAULTS["preset"], hide=("method",))
+    options.add_config_options(parser, options.DEFAULTS["preset"])
 
 
 def make_plan(arguments: argparse.Namespace) -> Plan:
     """Turns the options into a `Plan`. Raises `UsageError`, `ConfigError` or `DemonstrationsError` for wrong input."""
     given = {k: v for k, v in vars(arguments).items() if k not in ("out", "resume")}
-    if arguments.resume:
-        given = resumed(arguments.out, given)
-    plan = plan_of(given, arguments.out, resume=arguments.resume)
+    saved = resumed(arguments.out, given) if arguments.resume else {}
+    plan = plan_of(given, arguments.out, resume=arguments.resume, saved=saved)
     command_line.check_output_folder(plan.folder, resume=plan.resume)
     return plan
 
 
-def plan_of(given: Mapping[str, Any], folder: Path | None, *, resume: bool) -> Plan:
-    """The `Plan` of the options given, checked, but for its folder (a new one where it is None)."""
-    if "method" not in given:
-        raise UsageError(f"--method: required; one of {', '.join(METHOD_NAMES)}")
-    preset = options.METHOD_PRESETS.get(given["method"], options.DEFAULTS["preset"])
-    choices = {**options.DEFAULTS, "preset": preset, "env": None, "demos": None, "num_demos": None, **given}
-    config = options.config_from(choices, choices["preset"])
+def plan_of(
+    given: Mapping[str, Any],
+    folder: Path | None,
+    *,
+    resume: bool,
+    saved: Mapping[str, Any] = MappingProxyType({}),
+    load: Callable[[Path], Demonstrations] = load_demonstrations,
+) -> Plan:
+    """The `Plan` of the options given, checked, but for its folder (a new one where it is None).
+
+    Args:
+        given: the options that a person gave. One that makes no difference to the run is refused.
+        folder: of the run.
+        resume: whether the run goes on from its last checkpoint.
+        saved: the choices of the run that is resumed, for what is not given.
+        load: reads a file of demonstrations.
+    """
+    named = {**saved, **given}
+    if "method" not in named:
+        raise UsageError(f"--method: required; one of {', '.join(METHODS)}")
+    preset = options.METHOD_PRESETS.get(named["method"], options.DEFAULTS["preset"])
+    choices = {**options.DEFAULTS, "preset": preset, "env": None, "demos": None, "num_demos": None, **named}
+    config = options.config_from(given, choices["preset"], saved)
     task = options.find_task(choices["env"])
     env_options = options.env_options(choices, task)
-    path, demonstrations = find_demonstrations(config, task, choices["demos"], choices["num_demos"], env_options)
+    path, demonstrations = find_demonstrations(config, task, choices["demos"], choices["num_demos"], env_options, load)
+    if demonstrations is not None:
+        config = with_limit_of(config, demonstrations.mean_episode_cost)
     return Plan(
         config=config,
         preset=choices["preset"],
@@ -79,14 +98,23 @@ def plan_of(given: Mapping[str, Any], folder: Path | None, *, resume: bool) -> P
 
 
 def find_demonstrations(
-    config: Config, task: TaskInfo, path: Path | None, count: int | None, env_options: Mapping[str, Any]
+    config: Config,
+    task: TaskInfo,
+    path: Path | None,
+    count: int | None,
+    env_options: Mapping[str, Any],
+    load: Callable[[Path], Demonstrations] = load_demonstrations,
 ) -> tuple[Path | None, Demonstrations | None]:
     """Loads and checks the demonstrations that the method needs; the shipped file where `path` is None."""
     if path is None:
-        if config.method not in IMITATION_METHODS:
+        if not config.row.imitates:
+            if count is not None:
+                raise UsageError(
+                    f"--num-demos {count}: method {config.method} learns from no demonstrations; leave it out"
+                )
             return None, None
         path = _shipped(task.name)
-    demonstrations = load_demonstrations(path)
+    demonstrations = load(path)
     check_matches(demonstrations, path, task)
     for name, used in env_options.items():  # the expert's cost means nothing under another definition of cost
         recorded = demonstrations.metadata.get(name, used)

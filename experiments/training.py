@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ _EVALUATION_SEED_OFFSET = 10_000_019  # keeps evaluation episodes apart from tra
 class Plan:
     """Everything that was decided, and checked, before JAX is imported."""
 
-    config: Config
+    config: Config  # with its cost limit resolved
     preset: str
     task: str
     physics: str
@@ -41,10 +41,11 @@ class Plan:
     resume: bool
     eval_episodes: int
     command: str
+    moved: tuple[str, ...] = ()  # fields of `config` that are not those of the training that is resumed
 
     @property
     def cost_limit(self) -> float | None:
-        """The episode cost that training is held against: the prescribed limit, else J_E of the demonstrations."""
+        """What episode costs are shown against: the limit of the method, else J_E of the demonstrations, if known."""
         if self.config.cost_limit is not None or self.demonstrations is None:
             return self.config.cost_limit
         return self.demonstrations.mean_episode_cost
@@ -74,13 +75,19 @@ class Outcome:
 
 def execute(plan: Plan) -> Outcome:
     """Trains, evaluates, writes the whole run folder and prints the table. Raises as `execute_together` does."""
-    return execute_together([plan], plan.folder / "checkpoints")[0]
+    return execute_together([plan], plan.folder / "checkpoints", resume=plan.resume)[0]
 
 
-def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcome]:
+def execute_together(
+    plans: Sequence[Plan], checkpoint_dir: Path, *, resume: bool, finished: Collection[Path] = ()
+) -> list[Outcome]:
     """Carries out plans that differ in traced hyperparameters and folders alone as one program.
 
-    `checkpoint_dir` holds the checkpoints of all their runs together; in the end each folder has those of its own.
+    Args:
+        plans: all runs of the program.
+        checkpoint_dir: holds the checkpoints of all their runs together; in the end each folder has those of its own.
+        resume: whether training goes on from the newest checkpoint there, if there is one.
+        finished: run folders that are complete: they stay as they are, and have no outcome.
 
     Raises:
         LockedError: another process works in the run folder.
@@ -103,15 +110,16 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
         import envs  # with JAX behind it: not before the input has been checked
 
         env = envs.make(first.task, physics=first.physics, **first.env_options)
-        plans = [_with_earlier_commands(plan) for plan in plans]
-        for plan in plans:
+        missing = {i: _with_earlier_commands(plan) for i, plan in enumerate(plans) if plan.folder not in finished}
+        for plan in missing.values():
             run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
-        results, rate = _train(plans, env, checkpoint_dir, display, interruption)
-        for plan, result in zip(plans, results, strict=True):
+        results, rate = _train(plans, missing, env, checkpoint_dir, display, interruption, resume=resume)
+        carried_out = [(plan, results[i]) for i, plan in missing.items()]
+        for plan, result in carried_out:
             for seed in np.flatnonzero(result.stopped):
                 display.message(f"seed {seed} stopped: {faults.write(plan.folder, result, int(seed))}")
         display.message(f"evaluating {first.eval_episodes} episodes per seed ...")
-        evaluations, random = _evaluate(plans, results, env)
+        evaluations, random = _evaluate(carried_out, env)
         return [
             Outcome(
                 plan=plan,
@@ -121,7 +129,7 @@ def execute_together(plans: Sequence[Plan], checkpoint_dir: Path) -> list[Outcom
                 random=random,
                 summary=_finish(plan, result, rate, num_runs, evaluated, random),
             )
-            for plan, result, evaluated in zip(plans, results, evaluations, strict=True)
+            for (plan, result), evaluated in zip(carried_out, evaluations, strict=True)
         ]
 
 
@@ -136,20 +144,32 @@ def _with_earlier_commands(plan: Plan) -> Plan:
 
 
 def _train(
-    plans: Sequence[Plan], env: Any, checkpoint_dir: Path, display: Display, interruption: Interruption
+    plans: Sequence[Plan],
+    missing: Mapping[int, Plan],
+    env: Any,
+    checkpoint_dir: Path,
+    display: Display,
+    interruption: Interruption,
+    *,
+    resume: bool,
 ) -> tuple[list["Result"], float | None]:
-    """The results, and environment steps per second of all runs, compilation aside (None if nothing was left to do)."""
+    """The results, and environment steps per second of all runs, compilation aside (None if nothing was left to do).
+
+    Only the plans `missing`, by their numbers, are written to their folders.
+    """
     from ccil_jax import runner
 
     first, steps, seconds = plans[0], 0.0, 0.0
-    own = runner.columns(len(plans), first.num_seeds)
+    columns = runner.columns(len(plans), first.num_seeds)
 
     with contextlib.ExitStack() as stack:
-        writers = [stack.enter_context(run_folder.MetricsWriter(plan.folder)) for plan in plans]
+        writers = [
+            (stack.enter_context(run_folder.MetricsWriter(plan.folder)), columns[i]) for i, plan in missing.items()
+        ]
 
         def on_start(history: "History") -> None:
-            for writer, columns in zip(writers, own, strict=True):
-                writer.begin({name: rows[:, columns] for name, rows in history.items()})
+            for writer, own in writers:
+                writer.begin({name: rows[:, own] for name, rows in history.items()})
             interruption.defer()
 
         def on_progress(progress: "Progress") -> None:
@@ -158,8 +178,8 @@ def _train(
             steps += new_steps
             if new_steps:  # behaviour cloning takes none
                 seconds += new_steps / progress.env_steps_per_second
-            for writer, columns in zip(writers, own, strict=True):
-                writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
+            for writer, own in writers:
+                writer.write(progress.iteration, {name: rows[:, own] for name, rows in progress.metrics.items()})
             display.update(progress)
 
         results = runner.train_runs(
@@ -170,7 +190,8 @@ def _train(
             seed=first.seed,
             one_by_one=first.one_by_one,
             checkpoint_dir=checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
-            resume=any(plan.resume for plan in plans),
+            resume=resume,
+            moved=first.moved,
             on_start=on_start,
             on_progress=on_progress,
             should_stop=interruption.requested,
@@ -179,23 +200,23 @@ def _train(
     interruption.settle(
         f"stopped and saved after iteration {done} of {first.config.num_iterations}; continue with --resume"
     )
-    for plan, result in zip(plans, results, strict=True):
+    for i, plan in missing.items():
         if (directory := plan.folder / "checkpoints") != checkpoint_dir:
-            runner.save(result, directory)
+            runner.save(results[i], directory)
     return results, steps / seconds if seconds else None
 
 
-def _evaluate(plans: Sequence[Plan], results: Sequence["Result"], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:
-    """Evaluations of all plans, in one program, and that of the random policy."""
+def _evaluate(carried_out: Sequence[tuple[Plan, "Result"]], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:
+    """Evaluations of all runs, in one program, and that of the random policy."""
     import jax
 
     from ccil_jax import evaluation, runner
 
-    first = plans[0]
+    first, result = carried_out[0]
     settings: Any = {"num_episodes": first.eval_episodes, "seed": first.evaluation_seed}
-    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for result in results])
-    together = evaluation.evaluate(results[0].config, agents, env, **settings)
-    own = runner.columns(len(plans), first.num_seeds)
+    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for _, result in carried_out])
+    together = evaluation.evaluate(result.config, agents, env, **settings)
+    own = runner.columns(len(carried_out), first.num_seeds)
     evaluations = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], together) for rows in own]
     return evaluations, evaluation.random_policy(env, **settings)
 

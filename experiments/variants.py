@@ -7,13 +7,15 @@ A variant is a list of `train` options, so a program is handed to whatever proce
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ccil_jax.config import Config, field_names
+from ccil_jax.config import Config, field_names, relevant
+from ccil_jax.demonstrations import Demonstrations, load_demonstrations
 from ccil_jax.files import file_sha256
 from experiments import run_folder, train
 from experiments.command_line import Parser, UsageError
@@ -50,18 +52,31 @@ class _OptionParser(Parser):
         raise UsageError(" ".join(message.split()).removeprefix("argument "))
 
 
-def make_variant(name: str, fields: Mapping[str, Any], out: Path, *, alone: bool = False) -> Variant:
-    """The variant with these `train` options. Raises `UsageError`, `ConfigError` or `DemonstrationsError`."""
+def make_variant(
+    name: str,
+    fields: Mapping[str, Any],
+    out: Path,
+    *,
+    load: Callable[[Path], Demonstrations] = load_demonstrations,
+    alone: bool = False,
+) -> Variant:
+    """The variant with these `train` options. Raises `UsageError`, `ConfigError` or `DemonstrationsError`.
+
+    `load` reads a file of demonstrations; a cached one is given where many variants share a file.
+    """
     if "demos" in fields:  # a worker may be started elsewhere
         fields = {**fields, "demos": Path(fields["demos"]).resolve()}
-    return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, alone=alone)
+    return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, load, alone=alone)
 
 
-def _variant(name: str, given: Sequence[str], out: Path, *, alone: bool = False) -> Variant:
+def _variant(
+    name: str, given: Sequence[str], out: Path, load: Callable[[Path], Demonstrations], *, alone: bool = False
+) -> Variant:
     parser = _OptionParser("train", "")
     train.add_options(parser)
     folder = out / "runs" / name
-    plan = train.plan_of(vars(parser.parse_args(given)), folder, resume=(folder / "config.json").is_file())
+    resume = (folder / "config.json").is_file()
+    plan = train.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
     return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
 
 
@@ -78,7 +93,7 @@ def check_unchanged(variant: Variant) -> None:
     if not plan.resume:
         return
     run = run_folder.read_run(plan.folder)
-    chosen = {**dataclasses.asdict(plan.config), "task": plan.task, "seed": plan.seed, "num_seeds": plan.num_seeds}
+    chosen = {**relevant(plan.config), "task": plan.task, "seed": plan.seed, "num_seeds": plan.num_seeds}
     chosen |= {name: getattr(plan, name) for name in ("eval_episodes", "env_options", "one_by_one")}
     saved = {**run.facts, **dataclasses.asdict(run.config)}
     for name, value in chosen.items():
@@ -87,6 +102,11 @@ def check_unchanged(variant: Variant) -> None:
     demos = run.facts["demonstrations"]
     if demos and plan.demonstrations_path and file_sha256(plan.demonstrations_path) != demos["sha256"]:
         raise UsageError(f"--resume: {plan.folder} began with other demonstrations than {plan.demonstrations_path}")
+
+
+def run_of(variant: Variant) -> Hashable:
+    """What a variant trains, whatever it is called: two that are equal would train the same."""
+    return _shared(variant.plan), variant.plan.config
 
 
 def group(variants: Iterable[Variant], out: Path) -> list[Program]:
@@ -134,4 +154,5 @@ def read_program(folder: Path) -> Program:
         pairs = [(v["name"], v["options"]) for v in content["variants"]]
     except (KeyError, TypeError):
         raise UsageError(f"{folder}/program.json: damaged; repeat the sweep in another folder") from None
-    return Program(folder=folder, variants=tuple(_variant(name, given, out) for name, given in pairs))
+    load = functools.cache(load_demonstrations)
+    return Program(folder=folder, variants=tuple(_variant(name, given, out, load) for name, given in pairs))

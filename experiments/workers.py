@@ -6,6 +6,7 @@ program whose worker dies is carried on once, from its last checkpoint.
 
 import concurrent.futures
 import importlib.util
+import math
 import os
 import queue
 import subprocess
@@ -13,6 +14,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from experiments.command_line import UsageError
@@ -22,7 +24,11 @@ _PACKAGES = {"ray": "ray", "slurm": "submitit"}  # of the launchers, which are a
 _WRONG_INPUT = 2  # exit status; a second try would end in the same way
 _TRIES = 2
 _POLL_SECONDS = 2.0  # between two looks at SLURM jobs; submitit asks SLURM itself less often
+_GPU_MEMORY = ("XLA_PYTHON_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_PYTHON_CLIENT_ALLOCATOR")
+_SHARED_GPU_MEMORY = 0.8  # of a GPU that workers share; the rest is for their CUDA contexts
 _LONGEST_JOB_MINUTES = 24 * 60  # submitit's own default is five
+
+_STOPPED = "stopped before it began"
 
 Outcomes = Iterator[tuple[Path, str | None]]  # a program's folder and, if it failed, the last words of its worker
 
@@ -30,6 +36,28 @@ Outcomes = Iterator[tuple[Path, str | None]]  # a program's folder and, if it fa
 def usable_cpus() -> list[int]:
     """The CPUs that this process may run on."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def visible_gpus(environment: Mapping[str, str], driver: Path = Path("/proc/driver/nvidia/gpus")) -> list[str]:
+    """The NVIDIA GPUs that a process may use, as CUDA_VISIBLE_DEVICES names them; none without their driver."""
+    if (chosen := environment.get("CUDA_VISIBLE_DEVICES")) is not None:
+        return [name for name in chosen.split(",") if name]
+    return [str(i) for i in range(len(list(driver.iterdir())))] if driver.is_dir() else []
+
+
+def gpu_share(worker: int, num_workers: int, gpus: Sequence[str], environment: Mapping[str, str]) -> dict[str, str]:
+    """Variables that give one of several workers on this machine its GPU, and its part of that GPU's memory.
+
+    JAX takes three quarters of a GPU's memory when it starts, so a second worker on the same GPU would find none. What
+    the user says of memory has precedence.
+    """
+    if not gpus or num_workers == 1:
+        return {}
+    variables = {"CUDA_VISIBLE_DEVICES": gpus[worker % len(gpus)]}
+    sharing = math.ceil(num_workers / len(gpus))
+    if sharing > 1 and not any(name in environment for name in _GPU_MEMORY):
+        variables[_GPU_MEMORY[0]] = f"{_SHARED_GPU_MEMORY / sharing:.3f}"
+    return variables
 
 
 def check_launcher(launcher: str) -> None:
@@ -50,16 +78,24 @@ def launch(
     return in_processes(folders, num_workers)
 
 
-def run_worker(folder: Path, cpus: Sequence[int] = (), stopping: threading.Event | None = None) -> str | None:
+def run_worker(
+    folder: Path,
+    cpus: Sequence[int] = (),
+    stopping: threading.Event | None = None,
+    variables: Mapping[str, str] = MappingProxyType({}),
+) -> str | None:
     """Carries out the program in `folder` in a process of its own, and once more if that dies.
 
-    Returns the last words of a worker that failed for good. `stopping` ends it.
+    Returns the last words of a worker that failed for good. `stopping` ends it, and starts none once it is set.
+    `variables` are of its environment.
     """
     stopping = stopping or threading.Event()
     command = [sys.executable, "-m", "experiments.sweep_worker", str(folder), "--until-eof"]
     command += ["--cpus", ",".join(map(str, cpus))] if cpus else []
     log, status = folder / "worker.log", 0
     for _ in range(_TRIES):
+        if stopping.is_set():
+            return _STOPPED
         with (
             log.open("ab") as output,
             subprocess.Popen(
@@ -68,7 +104,7 @@ def run_worker(folder: Path, cpus: Sequence[int] = (), stopping: threading.Event
                 start_new_session=True,  # and not by a Ctrl-C, after which it would be tried again
                 stdout=output,
                 stderr=output,
-                env={**os.environ, "PYTHONPATH": python_path()},
+                env={**os.environ, **variables, "PYTHONPATH": python_path()},
             ) as process,
         ):
             while process.poll() is None:
@@ -83,17 +119,17 @@ def run_worker(folder: Path, cpus: Sequence[int] = (), stopping: threading.Event
 
 def in_processes(folders: Sequence[Path], num_workers: int) -> Outcomes:
     """Worker processes on this machine; each gets its share of the CPUs."""
-    cpus = usable_cpus()
+    cpus, gpus = usable_cpus(), visible_gpus(os.environ)
     num_workers = max(1, min(num_workers, len(folders), len(cpus)))
-    shares: queue.SimpleQueue[list[int]] = queue.SimpleQueue()
+    shares: queue.SimpleQueue[tuple[list[int], dict[str, str]]] = queue.SimpleQueue()
     for i in range(num_workers):
-        shares.put(cpus[i::num_workers])
+        shares.put((cpus[i::num_workers], gpu_share(i, num_workers, gpus, os.environ)))
     stopping = threading.Event()
 
     def carry_out(folder: Path) -> str | None:
         share = shares.get()
         try:
-            return run_worker(folder, share, stopping)
+            return run_worker(folder, share[0], stopping, share[1])
         finally:
             shares.put(share)
 
@@ -103,9 +139,9 @@ def in_processes(folders: Sequence[Path], num_workers: int) -> Outcomes:
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         finally:
-            stopping.set()
-            for future in futures:
+            for future in futures:  # those that have not begun, before the pool takes them for free hands
                 future.cancel()
+            stopping.set()
 
 
 def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
@@ -117,8 +153,13 @@ def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
         cpus = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
         share = max(1, min(max(cpus), sum(cpus) // num_workers))  # a task that no node can hold would wait for ever
         # Ray, too, starts a task once more whose process dies: the machine may be gone.
-        task = ray.remote(num_cpus=share, max_retries=_TRIES - 1)(run_worker)
-        waiting = {task.remote(folder): folder for folder in folders}
+        gpus = sum(node["Resources"].get("GPU", 0) for node in ray.nodes() if node["Alive"])
+        # Without a share of the GPUs Ray hides them from a task; parts of one are shared, and so is its memory.
+        gpu = min(1.0, math.floor(1000 * gpus / num_workers) / 1000)
+        shared = 0 < gpu < 1 and not any(name in os.environ for name in _GPU_MEMORY)
+        variables = {_GPU_MEMORY[0]: f"{_SHARED_GPU_MEMORY * gpu:.3f}"} if shared else {}
+        task = ray.remote(num_cpus=share, num_gpus=gpu, max_retries=_TRIES - 1)(run_worker)
+        waiting = {task.remote(folder, variables=variables): folder for folder in folders}
         while waiting:
             done, _ = ray.wait(list(waiting), num_returns=1)
             try:

@@ -181,21 +181,21 @@ WALK_DEMONSTRATIONS_COST = 2.25  # J_E of the above
 
 def walk_config(**changes: Any) -> Config:
     """A training program on `Walk` that is as small as it can be: 20 iterations, 10 a chunk."""
-    config = Config(
-        env_steps=20 * 2 * 32,
-        num_envs=4,
-        batch_size=32,
-        generator_steps=2,
-        hidden_sizes=(4,),
-        discriminator_minibatch_size=16,
-        critic_minibatch_size=8,
-        critic_epochs=2,
-        fisher_stride=2,
-        max_kl=0.02,
-        critic_learning_rate=0.01,
-        discriminator_learning_rate=0.01,
-    )
-    return config.replace(**changes)
+    base = {
+        "env_steps": 20 * 2 * 32,
+        "num_envs": 4,
+        "batch_size": 32,
+        "generator_steps": 2,
+        "hidden_sizes": (4,),
+        "discriminator_minibatch_size": 16,
+        "critic_minibatch_size": 8,
+        "critic_epochs": 2,
+        "fisher_stride": 2,
+        "max_kl": 0.02,
+        "critic_learning_rate": 0.01,
+        "discriminator_learning_rate": 0.01,
+    }
+    return Config.from_base(base, changes)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

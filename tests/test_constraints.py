@@ -9,7 +9,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from ccil_jax import constraints, policy_step
-from ccil_jax.config import PRESCRIBED_LIMIT_METHODS, Config
+from ccil_jax.agents import AGENTS
+from ccil_jax.config import Config
 from ccil_jax.constraints import Episodes
 from ccil_jax.methods import METHODS
 from ccil_jax.types import PyTree
@@ -93,14 +94,18 @@ def test_inverse_softplus_of_what_no_xi_reaches_is_the_smallest_allowed() -> Non
 # The table -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_table_and_the_configuration_agree_on_whose_limit_holds() -> None:
-    assert {name for name, row in METHODS.items() if row.limit == "prescribed"} == PRESCRIBED_LIMIT_METHODS
-    unconstrained = {name for name, row in METHODS.items() if row.limit == "none"}
-    assert (
-        unconstrained
-        == {"gail", "trpo"}
-        == {n for n, r in METHODS.items() if r.constraint is constraints.unconstrained}
-    )
+def test_a_limit_holds_where_the_cost_enters_and_nowhere_else() -> None:
+    assert {name for name, row in METHODS.items() if row.limit == "prescribed"} == {"lgail", "expert"}
+    assert {name for name, row in METHODS.items() if row.limit is None} == {"gail", "trpo", "bc", "iq_learn"}
+    assert {name for name, row in METHODS.items() if row.constraint == "unconstrained"} == {"gail", "trpo"}
+
+
+def test_every_name_in_the_table_stands_for_something() -> None:
+    for row in METHODS.values():
+        assert row.agent in AGENTS
+        assert (row.constraint in constraints.CONSTRAINTS) == (row.agent == "on_policy")
+        assert (row.reward is not None) == (row.agent == "on_policy")
+        assert row.imitates == (row.reward != "task")
 
 
 def test_lagrangian_combines_reward_less_lambda_times_cost_and_gail_ignores_the_cost() -> None:
@@ -153,8 +158,8 @@ def test_the_episode_gate_takes_the_reward_on_steps_of_episodes_within_the_limit
 
 def test_no_other_method_gates_its_advantages() -> None:
     reward, episodes = jnp.ones((3, 2)), Episodes(cost=jnp.full((3, 2), 9.0), limit=jnp.asarray(1.0))
-    for name, row in METHODS.items():
-        gated = row.constraint(Config(method=name, cost_limit=1.0)).gate(reward, -reward, episodes)
+    for name in (name for name, row in METHODS.items() if row.constraint):
+        gated = constraints.make(Config(method=name, cost_limit=1.0)).gate(reward, -reward, episodes)
         np.testing.assert_array_equal(gated, reward)
 
 
@@ -176,7 +181,7 @@ def test_the_entropy_bonus_counts_once_in_every_direction_of_the_step(name: str,
     @jax.jit
     def run(gap: jax.Array, coefficient: jax.Array) -> tuple[jax.Array, jax.Array]:
         config = problem.config.replace(policy_entropy_coefficient=coefficient)
-        constraint = METHODS[name].constraint(config)
+        constraint = constraints.make(config)
         batch = problem.training.replace(reward_advantage=zero, cost_advantage=zero)
         multiplier = jnp.asarray(0.7)
         new, taken, _ = policy_step.improve(

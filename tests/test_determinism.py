@@ -12,7 +12,9 @@ import pytest
 
 from ccil_jax import runner
 from ccil_jax.checkpointing import Checkpointer
-from ccil_jax.config import METHOD_NAMES, PRESCRIBED_LIMIT_METHODS, Config
+from ccil_jax.config import Config, unused
+from ccil_jax.digests import Identity
+from ccil_jax.methods import METHODS
 from ccil_jax.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
@@ -64,17 +66,17 @@ NUM_ITERATIONS = 20
 
 
 def config_of(method: str) -> Config:
-    limit = 1.0 if method in PRESCRIBED_LIMIT_METHODS else None
-    return walk_config(
-        method=method, env_steps=NUM_ITERATIONS * 64, cost_limit=limit, bc_epochs=NUM_ITERATIONS, replay_size=64
-    )
+    limit = {"cost_limit": 1.0} if METHODS[method].limit == "prescribed" else {}
+    config = walk_config(method=method, **limit)
+    lengths = {"env_steps": NUM_ITERATIONS * 64, "bc_epochs": NUM_ITERATIONS, "replay_size": 64}
+    return config.replace(**{name: value for name, value in lengths.items() if name not in unused(config)})
 
 
 DEFAULT = ("malm", "iq_learn")
 
 
 @pytest.mark.parametrize(
-    "method", [name if name in DEFAULT else pytest.param(name, marks=pytest.mark.slow) for name in METHOD_NAMES]
+    "method", [name if name in DEFAULT else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
 )
 def test_a_run_stopped_after_any_iteration_goes_on_as_if_it_had_not_been(method: str, tmp_path: Path) -> None:
     """Through a checkpoint on disk, for every method and every iteration (a few of them, in the quick tests)."""
@@ -93,7 +95,7 @@ def test_a_run_stopped_after_any_iteration_goes_on_as_if_it_had_not_been(method:
     keys = jax.random.split(jax.random.key(0), 2)
     whole = run(program.init(keys), NUM_ITERATIONS)
     for stop in (1, 7, 19) if method in DEFAULT else range(1, NUM_ITERATIONS + 1):
-        with Checkpointer(tmp_path / str(stop), config) as checkpoints:
+        with Checkpointer(tmp_path / str(stop), Identity(configs=(config,))) as checkpoints:
             checkpoints.save(stop, {"state": run(program.init(keys), stop)})
             state = checkpoints.restore(stop, {"state": program.state})["state"]
         assert same_bits(run(state, NUM_ITERATIONS - stop), whole), stop

@@ -3,6 +3,7 @@
 Small states without training; `test_resume` and `tests/faults.py` do the same with whole runs.
 """
 
+import dataclasses
 import errno
 import json
 import logging
@@ -21,11 +22,19 @@ import pytest
 from ccil_jax import checkpointing, digests, files
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import Config
-from ccil_jax.digests import CheckpointError
+from ccil_jax.digests import CheckpointError, Identity
 from ccil_jax.files import LockedError
 from tests.probe_envs import same_bits
 
-CONFIG = Config(cost_limit=1.0)
+CONFIG = Config(method="lgail", cost_limit=1.0)
+IDENTITY = Identity(
+    configs=(CONFIG, CONFIG.replace(cost_limit=2.0)),
+    num_seeds=1,
+    seed=0,
+    task="Walk",
+    max_episode_steps=100,
+    demonstrations="ab12",
+)
 
 
 def state(step: int) -> dict[str, Any]:
@@ -42,7 +51,7 @@ def state(step: int) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("checkpoints")
-    with Checkpointer(folder, CONFIG) as checkpoints:
+    with Checkpointer(folder, IDENTITY) as checkpoints:
         for step in (1, 2, 3):
             checkpoints.save(step, state(step))
     return folder
@@ -59,13 +68,14 @@ def shapes(tree: Any) -> Any:
 
 def test_what_is_saved_comes_back(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["2", "3"]
-    with Checkpointer(folder, CONFIG) as checkpoints:
+    with Checkpointer(folder, IDENTITY) as checkpoints:
         assert checkpoints.latest_step() == 3
         assert same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
     manifest = json.loads((folder / "3" / digests.NAME).read_text())
     assert manifest["arrays"]["params.kernel"]["shape"] == [2, 250]
     assert manifest["arrays"]["key"]["dtype"] == "key<fry>"
-    assert manifest["config"]["max_kl"] == CONFIG.max_kl
+    assert [config["cost_limit"] for config in manifest["identity"]["configs"]] == [1.0, 2.0]
+    assert manifest["identity"]["demonstrations"] == "ab12"
     assert "jax" in manifest["versions"]
 
 
@@ -101,13 +111,13 @@ def test_the_newest_good_step_is_used(
         shutil.copytree(folder, copy)
         spoil(copy / file)
         caplog.clear()
-        with Checkpointer(copy, CONFIG, readonly=True) as reader, caplog.at_level(logging.WARNING):
+        with Checkpointer(copy, IDENTITY, readonly=True) as reader, caplog.at_level(logging.WARNING):
             assert reader.latest_step() == 2
         assert f"{file}: " in caplog.text
         assert "going on from step 2" in caplog.text
         shutil.rmtree(copy)
     spoil(folder / files[0])
-    with Checkpointer(folder, CONFIG) as checkpoints:
+    with Checkpointer(folder, IDENTITY) as checkpoints:
         step = checkpoints.latest_step()
         assert step == 2
         assert same_bits(checkpoints.restore(2, shapes(state(0))), state(2))
@@ -117,7 +127,7 @@ def test_the_newest_good_step_is_used(
 
 def test_an_unfinished_step_is_no_checkpoint(tmp_path: Path) -> None:
     """Killed between orbax's commit and the manifest, in the first save of all: the run starts over."""
-    with Checkpointer(tmp_path, CONFIG) as checkpoints:
+    with Checkpointer(tmp_path, IDENTITY) as checkpoints:
         checkpoints.save(1, state(1))
         (tmp_path / "1" / digests.NAME).unlink()
         assert checkpoints.latest_step() is None
@@ -128,7 +138,7 @@ def test_an_unfinished_step_is_no_checkpoint(tmp_path: Path) -> None:
 def test_nothing_intact_is_an_error(folder: Path) -> None:
     for step in ("2", "3"):
         truncate(folder / step / digests.NAME)
-    with Checkpointer(folder, CONFIG) as checkpoints, pytest.raises(CheckpointError, match="no other is intact"):
+    with Checkpointer(folder, IDENTITY) as checkpoints, pytest.raises(CheckpointError, match="no other is intact"):
         checkpoints.latest_step()
     assert (folder / "3").exists()
 
@@ -144,23 +154,100 @@ OTHERS: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
 
 @pytest.mark.parametrize(("change", "message"), OTHERS.values(), ids=list(OTHERS))
 def test_another_program_is_refused(folder: Path, change: Callable[[dict[str, Any]], Any], message: str) -> None:
-    with Checkpointer(folder, CONFIG) as checkpoints, pytest.raises(CheckpointError, match=message):
+    with Checkpointer(folder, IDENTITY) as checkpoints, pytest.raises(CheckpointError, match=message):
         checkpoints.restore(3, shapes(change(state(0))))
 
 
-def test_another_configuration_is_refused(folder: Path) -> None:
-    with (
-        Checkpointer(folder, CONFIG.replace(max_kl=0.5)) as checkpoints,
-        pytest.raises(CheckpointError, match=r"written with max_kl 0\.01, this run has 0\.5"),
-    ):
+def other(**changes: Any) -> Identity:
+    return dataclasses.replace(IDENTITY, **changes)
+
+
+STRANGERS: dict[str, tuple[Identity, str]] = {
+    "first configuration": (
+        other(configs=(CONFIG.replace(max_kl=0.5), IDENTITY.configs[1])),
+        r"written with max_kl 0\.01, this run has 0\.5",
+    ),
+    "second configuration": (
+        other(configs=(CONFIG, CONFIG.replace(cost_limit=3.0))),
+        r"written with cost_limit 2\.0, this run has 3\.0",
+    ),
+    "order of the configurations": (other(configs=IDENTITY.configs[::-1]), r"cost_limit 1\.0, this run has 2\.0"),
+    "fewer configurations": (other(configs=(CONFIG,)), "written with number of configurations 2, this run has 1"),
+    "seed": (other(seed=7), "written with seed 0, this run has 7"),
+    "number of seeds": (other(num_seeds=2), "written with num_seeds 1, this run has 2"),
+    "task": (other(task="Sign"), "written with task Walk, this run has Sign"),
+    "time limit": (other(max_episode_steps=50), "written with max_episode_steps 100, this run has 50"),
+    "demonstrations": (other(demonstrations="cd34"), "written with demonstrations ab12, this run has cd34"),
+}
+
+
+@pytest.mark.parametrize(("identity", "message"), STRANGERS.values(), ids=list(STRANGERS))
+def test_another_training_is_refused(folder: Path, identity: Identity, message: str) -> None:
+    with Checkpointer(folder, identity) as checkpoints, pytest.raises(CheckpointError, match=message):
         checkpoints.restore(3, shapes(state(0)))
-    with Checkpointer(folder, CONFIG.replace(env_steps=10**9)) as checkpoints:
+
+
+@pytest.mark.parametrize(
+    "identity",
+    [
+        other(configs=tuple(config.replace(env_steps=10**9) for config in IDENTITY.configs)),  # for longer
+        other(configs=tuple(config.replace(gate="episode") for config in IDENTITY.configs)),  # lgail has no gate
+        other(seed=None, demonstrations=None),  # not known
+    ],
+)
+def test_what_makes_no_difference_is_not_compared(folder: Path, identity: Identity) -> None:
+    with Checkpointer(folder, identity) as checkpoints:
         checkpoints.restore(3, shapes(state(0)))
+
+
+def test_a_field_that_may_move_is_not_compared(folder: Path) -> None:
+    identity = other(configs=(CONFIG.replace(cost_limit=5.0), CONFIG.replace(cost_limit=6.0, max_kl=0.5)))
+    with Checkpointer(folder, identity, free=frozenset({"cost_limit", "max_kl"})) as checkpoints:
+        checkpoints.restore(3, shapes(state(0)))
+
+
+def test_a_checkpoint_of_before_there_were_identities_is_compared_by_its_configuration(folder: Path) -> None:
+    path = folder / "3" / digests.NAME
+    manifest = json.loads(path.read_text())
+    del manifest["sha256"]
+    manifest["config"] = manifest.pop("identity")["configs"][0]
+    path.write_text(json.dumps({**manifest, "sha256": digests._sha256(manifest)}))
+    with Checkpointer(folder, other(seed=7)) as checkpoints:
+        checkpoints.restore(3, shapes(state(0)))
+    identity = other(configs=(CONFIG.replace(gamma=0.5),))
+    with Checkpointer(folder, identity) as checkpoints, pytest.raises(CheckpointError, match="gamma"):
+        checkpoints.restore(3, shapes(state(0)))
+
+
+def test_a_step_that_is_there_is_never_saved_over(folder: Path) -> None:
+    """Orbax would decline in silence, and a new manifest beside old files would make them look damaged."""
+    with Checkpointer(folder, IDENTITY) as checkpoints:
+        with pytest.raises(CheckpointError, match="3: exists already"):
+            checkpoints.save(3, state(7))
+        with pytest.raises(CheckpointError, match="1: not saved, as"):
+            checkpoints.save(1, state(1))
+        assert checkpoints.latest_step() == 3
+        assert same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
+        with pytest.raises(CheckpointError, match=r"holds checkpoints already \(steps 2, 3\)"):
+            checkpoints.check_empty()
+
+
+def test_what_is_replaced_is_set_aside_whole(folder: Path) -> None:
+    with Checkpointer(folder, IDENTITY) as checkpoints:
+        before = (folder / "3" / digests.NAME).read_bytes()
+        checkpoints.replace(3, state(3))  # the same arrays: nothing to do
+        assert (folder / "3" / digests.NAME).read_bytes() == before
+        checkpoints.replace(2, state(7))
+        assert sorted(path.name for path in folder.iterdir()) == ["2", "2.replaced", "3.replaced"]
+        assert checkpoints.latest_step() == 2
+        assert same_bits(checkpoints.restore(2, shapes(state(0))), state(7))
+    assert (folder / "3.replaced" / digests.NAME).read_bytes() == before
+    digests.read(folder / "2.replaced")
 
 
 def test_a_full_disk_ends_the_run_now(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before the save, where the space is known to be short; in the save, where it runs out behind our back."""
-    with Checkpointer(folder, CONFIG) as checkpoints:
+    with Checkpointer(folder, IDENTITY) as checkpoints:
         usage = shutil.disk_usage(folder)._replace(free=1000)
         with monkeypatch.context() as patch:
             patch.setattr(checkpointing.shutil, "disk_usage", lambda path: usage)

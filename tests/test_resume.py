@@ -1,11 +1,19 @@
 """A run that stops half-way and goes on from its checkpoint ends as the unbroken run does, bit for bit."""
 
+import contextlib
+import dataclasses
+import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
+import pytest
 
 from ccil_jax import runner
+from ccil_jax.config import ConfigError
+from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.digests import CheckpointError
 from ccil_jax.runner import Result
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
@@ -42,6 +50,73 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
         assert same_bits(resumed.metrics[name][:10], half.metrics[name]), name
     np.testing.assert_array_equal(whole.metrics["env_steps"][:, 0], 64 * np.arange(1, 21))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(whole.metrics))
+
+
+def test_a_folder_with_checkpoints_is_not_trained_into(tmp_path: Path) -> None:
+    half = train(tmp_path, stop_after=10)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name[0] != "."}
+    with pytest.raises(CheckpointError, match=r"holds checkpoints already \(steps 10\)"):
+        train(tmp_path)
+    assert {path: path.read_bytes() for path in before} == before
+    again = train(tmp_path, resume=True, stop_after=0)  # reads, and takes no step
+    assert same_bits(again.state, half.state)
+
+
+def test_no_step_is_no_step(tmp_path: Path) -> None:
+    nothing = train(tmp_path, stop_after=0)
+    assert (nothing.env_steps, nothing.metrics) == (0, {})
+    assert not (tmp_path / "0").exists()
+    with pytest.raises(ConfigError, match="stop_after -1: must be at least 0"):
+        train(stop_after=-1)
+
+
+def other_demonstrations() -> Demonstrations:
+    same = walk_demonstrations()
+    return dataclasses.replace(same, actions=-same.actions)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"seed": 4}, "written with seed 3, this run has 4"),
+        ({"num_seeds": 1}, "written with num_seeds 2, this run has 1"),
+        ({"demonstrations": other_demonstrations()}, "written with demonstrations [0-9a-f]{64}, this run has"),
+        ({"rates": (0.01, 0.03)}, r"written with critic_learning_rate 0\.02, this run has 0\.03"),
+        ({"rates": (0.02, 0.01)}, r"written with critic_learning_rate 0\.01, this run has 0\.02"),
+        ({"rates": (0.01,)}, "written with number of configurations 2, this run has 1"),
+        ({"rates": (0.01, 0.03), "moved": ("critic_learning_rate",)}, ""),
+        ({"moved": ("hidden_sizes",)}, "moved hidden_sizes: only a traced field may differ"),
+    ],
+)
+def test_another_training_is_not_resumed(several: Path, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    shutil.copytree(several, tmp_path / "copy")
+    with contextlib.nullcontext() if not message else pytest.raises(ConfigError, match=message):
+        assert train_several(tmp_path / "copy", resume=True, stop_after=1, **changes)[0].env_steps == 64
+
+
+def train_several(
+    directory: Path,
+    *,
+    rates: tuple[float, ...] = (0.01, 0.02),
+    demonstrations: Demonstrations | None = None,
+    num_seeds: int = 2,
+    seed: int = 3,
+    **settings: Any,
+) -> list[Result]:
+    configs = [walk_config(method="gail", critic_learning_rate=rate) for rate in rates]
+    demonstrations = demonstrations or walk_demonstrations()
+    with quick_compilation():
+        return runner.train_runs(
+            configs, Walk(), demonstrations, num_seeds=num_seeds, seed=seed, checkpoint_dir=directory, **settings
+        )
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The checkpoints of two configurations that are trained together, after one iteration."""
+    folder = tmp_path_factory.mktemp("several")
+    train_several(folder, stop_after=1)
+    return folder
 
 
 def test_a_longer_run_ends_where_it_should(tmp_path: Path) -> None:
