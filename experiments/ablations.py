@@ -125,7 +125,8 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
     chosen = [(name, answer) for name in names for answer in QUESTIONS[name].answers]
     configs = {key: _config(fields, QUESTIONS[key[0]].answers[key[1]], QUESTIONS[key[0]].method) for key in chosen}
     idle = {key: set(unused(config)) for key, config in configs.items()}
-    check_used(configs[chosen[0]], shared.keys() & set.intersection(*idle.values()))
+    with options.errors_name_options():
+        check_used(configs[chosen[0]], shared.keys() & set.intersection(*idle.values()))
     load = functools.cache(load_demonstrations)
     for name, answer in chosen:
         question = QUESTIONS[name]

@@ -1,11 +1,12 @@
 """Options that training launchers share: the `Config` fields, and what a run is besides its hyperparameters."""
 
 import argparse
+import contextlib
 import dataclasses
 import difflib
 import types
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -96,12 +97,19 @@ def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] 
         ConfigError: also for an option given that makes no difference to the run.
     """
     base, changes = ({k: v for k, v in fields.items() if k in CONFIG_FIELDS} for fields in (saved, given))
-    try:
+    with errors_name_options():
         config = Config.from_base({**PRESETS[preset], **base}, changes)
         validate(config)
+    return config
+
+
+@contextlib.contextmanager
+def errors_name_options() -> Iterator[None]:
+    """Has a `ConfigError` speak of options as they are typed, `--max-kl`, and not of fields, `--max_kl`."""
+    try:
+        yield
     except ConfigError as error:
         raise ConfigError(_with_hyphens(str(error))) from None
-    return config
 
 
 def find_task(name: str | None, option: str = "--env") -> TaskInfo:
