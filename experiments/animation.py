@@ -84,8 +84,11 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
     )
 
 
-def play_run(run: Run, seed: int, caption: str) -> str:
-    """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above."""
+def play_run(run: Run, seed: int, name: str, caption: str) -> str:
+    """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above.
+
+    `name` is unique on the page; the caption says whose episode it is.
+    """
     import envs
     from ccil_jax import runner
 
@@ -98,7 +101,7 @@ def play_run(run: Run, seed: int, caption: str) -> str:
         return (
             f"<figure>{figures.html_image(image, 'an episode from above')}<figcaption>{caption}</figcaption></figure>"
         )
-    return to_html(record_poses(env, policy), f"episode-{env.name}-{run.folder.resolve().name}", caption)
+    return to_html(record_poses(env, policy), name, caption)
 
 
 def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> np.ndarray:
