@@ -26,9 +26,9 @@ _COLUMNS = (
     ("cost_rate", "cost rate in training"),
 )
 _NOTE = (
-    "Rows of runs: interquartile mean over seeds with its 95% bootstrap interval, [-] where there are too few seeds for "
-    "one. Rows of seeds and levels: mean &plusmn; standard error over episodes. A dash: not known. What each number means "
-    "is defined in docs/metrics.md of ccil_jax."
+    "Runs: interquartile mean over seeds with its 95% bootstrap interval, [-] where there are too few seeds for one. "
+    "Seeds, expert and random policy: mean &plusmn; standard error over episodes. A dash: not known. Marked (*): a "
+    f"violation {html.escape(BEYOND_ERROR)}. What each number means is defined in docs/metrics.md of ccil_jax."
 )
 _STYLE = """
 :root { color-scheme: light; --ink: #22262b; --soft: #5b626c; --line: #e3e6ea; --accent: #0b6e99; }
@@ -42,7 +42,8 @@ div.wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 600; }
-td .beyond { color: #a0281f; font-weight: 600; cursor: help; } td small { color: var(--soft); } details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); }
+td .beyond { color: #a0281f; font-weight: 600; cursor: help; }
+td small { color: var(--soft); } details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); }
 code { font-size: .86rem; background: #f4f6f8; padding: .05rem .3rem; white-space: pre-wrap; }
 """
 
@@ -93,9 +94,8 @@ def read_entries(folders: Sequence[Path]) -> list[Entry]:
         if not (folder / "summary.json").is_file():
             raise UsageError(f"RUN_DIR {folder}: not finished (no summary.json); finish it with `train --resume`")
         entries.append(Entry(run, run_folder.read_json(folder / "summary.json"), run.config.method, len(entries)))
-    return [
-        _distinct(e, [other for other in entries if (other.task, other.label) == (e.task, e.label)]) for e in entries
-    ]
+    alike = ([other for other in entries if (other.task, other.label) == (e.task, e.label)] for e in entries)
+    return [_distinct(e, others) for e, others in zip(entries, alike, strict=True)]
 
 
 def _distinct(entry: Entry, alike: Sequence[Entry]) -> Entry:

@@ -166,10 +166,9 @@ def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, 
     table.add_section()
     levels = dataclasses.asdict(reference)
     for name, text, recovered, violation in (("expert", "expert", "100", "0"), ("random", "random policy", "0", "")):
-        means = [levels[f"{name}_{x}"] for x in ("return", "cost")]
-        errors = [levels[f"{name}_{x}_standard_error"] for x in ("return", "cost")]
-        if means != [None, None]:
-            table.add_row(text, *map(with_error, means, errors), recovered, violation)
+        pairs = [(levels[key], levels[f"{key}_standard_error"]) for key in (f"{name}_return", f"{name}_cost")]
+        if any(mean is not None for mean, _ in pairs):
+            table.add_row(text, *(with_error(*pair) for pair in pairs), recovered, violation)
     if reference.cost_limit is not None:
         table.add_row("cost limit", "", number(reference.cost_limit), "", "")
     is_marked = mean_is_beyond or any(row.get("violation_beyond_error") for row in rows)
