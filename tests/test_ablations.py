@@ -119,7 +119,7 @@ def test_table_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_few_seeds_have_no_interval_and_violations_are_marked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """From the run folder to table, CSV file and figure; the second folder is of an earlier version, one seed lacks a score."""
+    """From the run folder to table, CSV file and figure. The second is of an earlier version, and lacks a score."""
     rows = []
     for name, values, marks in (("[red]", [2.0, 4.0], {"violation_beyond_error": True}), ("$_{x$", [1.0, None], {})):
         folder = tmp_path / name
