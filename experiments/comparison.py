@@ -82,7 +82,8 @@ def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], sect
             previous = content.get(section)
         table.add_row(*(_shown(content, name) for name in columns))
     mark = f"*: {BEYOND_ERROR}" if any(content.get("violation_beyond_error") for content in rows) else ""
-    table.caption = "; ".join(filter(None, (mark, note_on_intervals(rows)))) or None
+    note = note_on_intervals(rows)
+    table.caption = "; ".join(filter(None, (mark, note and f"-: {note}"))) or None
     show(table)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -44,13 +45,11 @@ def draw_groups(path: Path, groups: Mapping[str, Sequence[Row]], label: str, tit
 def _draw_rows(axes: Axes, rows: Sequence[Row], name: str) -> None:
     for i, row in enumerate(rows):
         color = COLORS[i % len(COLORS)]
-        if row[name] is None:
-            continue
-        if row[f"{name}_low"] is not None:
-            axes.plot([row[f"{name}_low"], row[f"{name}_high"]], [i, i], color=color, linewidth=2.2, alpha=0.55)
-        values = row[f"{name}_per_seed"]
+        value, low, high = np.array([row[name], row[f"{name}_low"], row[f"{name}_high"]], np.float64)  # NaN: not drawn
+        axes.plot([low, high], [i, i], color=color, linewidth=2.2, alpha=0.55)
+        values = np.array(row[f"{name}_per_seed"], np.float64)
         axes.plot(values, [i] * len(values), linestyle="", marker="o", markersize=3.2, color=color, alpha=0.8)
-        axes.plot(row[name], i, marker="D", markersize=7, color=color, markeredgecolor="white")
+        axes.plot(value, i, marker="D", markersize=7, color=color, markeredgecolor="white")
     if name in _REFERENCES:
         axes.update_datalim([(_REFERENCES[name], 0), (_REFERENCES[name] + 0.1, 0)])  # no scale of rounding errors
         axes.axvline(_REFERENCES[name], color="#22262b", linewidth=1.0, linestyle=(0, (5, 3)))

@@ -21,7 +21,7 @@ SCORES = (
     "episode_length",
 )
 BEYOND_ERROR = "beyond the demonstrations' error"  # what the mark of a violation says
-NO_INTERVAL = f"-: no interval below {MIN_SEEDS} seeds"
+NO_INTERVAL = f"no interval below {MIN_SEEDS} seeds"
 _MAX_RELATIVE_VIOLATION = 5.0  # caps the penalty: one diverged seed must not decide a mean
 
 
@@ -173,7 +173,7 @@ def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, 
         table.add_row("cost limit", "", number(reference.cost_limit), "", "")
     is_marked = mean_is_beyond or any(row.get("violation_beyond_error") for row in rows)
     notes = ["+-: standard error over episodes", f"*: {BEYOND_ERROR}" if is_marked else ""]
-    table.caption = "; ".join(filter(None, [*notes, NO_INTERVAL if len(rows) < MIN_SEEDS else ""]))
+    table.caption = "; ".join(filter(None, [*notes, f"-: {NO_INTERVAL}" if len(rows) < MIN_SEEDS else ""]))
     show(table)
 
 
@@ -182,7 +182,9 @@ def show(table: Any) -> None:
     from rich.console import Console
 
     console = Console(markup=False, emoji=False)
-    (console if console.is_terminal else Console(width=160, markup=False, emoji=False)).print(table)
+    if not console.is_terminal:
+        console.width = 160
+    console.print(table)
 
 
 def marked(text: str, beyond_error: bool | None) -> str:
