@@ -44,6 +44,12 @@ class Reference:
         """The level that violations are counted from: J_E, or the prescribed limit where there is no expert."""
         return self.cost_limit if self.expert_cost is None else self.expert_cost
 
+    def recovered_return(self, episode_return: float) -> float | None:
+        """A return in per cent on the scale from R_0 to R_E; None where there is no such scale."""
+        if self.expert_return is None or self.expert_return == self.random_return:
+            return None
+        return 100 * (episode_return - self.random_return) / (self.expert_return - self.random_return)
+
     def violation_beyond_error(self, episode_cost: float) -> bool | None:
         """Whether a mean cost exceeds J_E by more than the standard error of J_E; None where there is no such error."""
         if self.cost_limit is not None or self.expert_cost is None or self.expert_cost_standard_error is None:
@@ -89,15 +95,13 @@ def has_multiplier(config: Config) -> bool:
 
 def scores(episode_return: float, episode_cost: float, reference: Reference) -> dict[str, float | bool | None]:
     """The derived metrics of one seed's mean return and cost; None where the reference lacks a level."""
-    violation = relative = recovered = penalized = None
+    violation = relative = penalized = None
+    recovered = reference.recovered_return(episode_return)
     if reference.allowed_cost is not None:
         violation = max(0.0, episode_cost - reference.allowed_cost)
         relative = violation / max(reference.allowed_cost, 1.0)
-    if reference.expert_return is not None and reference.expert_return != reference.random_return:
-        span = reference.expert_return - reference.random_return
-        recovered = 100 * (episode_return - reference.random_return) / span
-        if relative is not None:
-            penalized = recovered - 100 * min(relative, _MAX_RELATIVE_VIOLATION)
+    if recovered is not None and relative is not None:
+        penalized = recovered - 100 * min(relative, _MAX_RELATIVE_VIOLATION)
     return {
         "episode_return": episode_return,
         "episode_cost": episode_cost,
@@ -165,10 +169,11 @@ def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, 
     table.add_row("mean", *mean[:3], marked(mean[3], mean_is_beyond))
     table.add_section()
     levels = dataclasses.asdict(reference)
+    has_scale = reference.recovered_return(reference.random_return) is not None
     for name, text, recovered, violation in (("expert", "expert", "100", "0"), ("random", "random policy", "0", "")):
         pairs = [(levels[key], levels[f"{key}_standard_error"]) for key in (f"{name}_return", f"{name}_cost")]
         if any(mean is not None for mean, _ in pairs):
-            table.add_row(text, *(with_error(*pair) for pair in pairs), recovered, violation)
+            table.add_row(text, *(with_error(*pair) for pair in pairs), recovered if has_scale else "-", violation)
     if reference.cost_limit is not None:
         table.add_row("cost limit", "", number(reference.cost_limit), "", "")
     is_marked = mean_is_beyond or any(row.get("violation_beyond_error") for row in rows)

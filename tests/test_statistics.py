@@ -203,6 +203,14 @@ def test_the_table_shows_errors_marks_and_no_interval_of_two_seeds(capsys: pytes
     printed = capsys.readouterr().out
     assert lines_of(printed)["95% interval"][1] == "41.00 to 41.00"
     assert "beyond" not in printed and "no interval" not in printed
+    alone = Reference(expert_return=None, expert_cost=None, random_return=1.0, random_cost=2.0, cost_limit=20.0)
+    rows = per_seed_scores(Episodes(costs, costs, costs), None, alone)
+    summary.print_table("t", rows, aggregate_scores(rows), alone)
+    lines = lines_of(capsys.readouterr().out)
+    assert "expert" not in lines
+    assert lines["random policy"] == ["1.00 +- -", "2.00 +- -", "-", ""]  # without an expert there is no scale
+    assert lines["cost limit"] == ["", "20.00", "", ""]
+    assert lines["seed 1"][2:] == ["-", "1.60"]
 
 
 def test_methods_with_a_multiplier() -> None:
