@@ -92,6 +92,17 @@ class Demonstrations:
         return None if returns is None else float(np.mean(returns))
 
     @property
+    def cost_standard_error(self) -> float | None:
+        """How uncertain J_E is: its standard error over the episodes; None for a single one (docs/metrics.md)."""
+        return standard_error(self.episode_costs)
+
+    @property
+    def return_standard_error(self) -> float | None:
+        """How uncertain R_E is: its standard error over the episodes; None for a single one, or without rewards."""
+        returns = self.episode_returns
+        return None if returns is None else standard_error(returns)
+
+    @property
     def mean_episode_length(self) -> float:
         """Mean steps per episode."""
         return float(np.mean(self.episode_lengths))
@@ -107,6 +118,11 @@ class Demonstrations:
     def _episode_sums(self, values: np.ndarray) -> np.ndarray:
         starts = np.concatenate([[0], self.episode_ends[:-1]])
         return np.add.reduceat(values.astype(np.float64), starts)
+
+
+def standard_error(values: np.ndarray) -> float | None:
+    """The standard error of the mean of `values [n]`; None for fewer than two, whose spread is unknown."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
 
 def load_demonstrations(path: str | os.PathLike[str], *, default_cost: float | None = None) -> Demonstrations:

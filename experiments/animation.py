@@ -47,13 +47,14 @@ _SCRIPT = """
 """
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Poses:
     """F frames of G line segments in a plane, in metres: x1, y1, x2, y2."""
 
     frames: np.ndarray  # [F, G, 4]
     radii: np.ndarray  # [G]
     costs: np.ndarray  # [F] bool: a cost was paid in this frame
+    num_steps: int  # of the episode, which may be longer
     seconds_per_frame: float
     above: bool  # the plane is the floor; otherwise it is vertical, y upwards
 
@@ -67,7 +68,7 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
     model, data = env.model, mujoco.MjData(env.model)
     geoms = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     axes = [0, 1] if env.name in _FROM_ABOVE else [0, 2]
-    frames, costs, cost = [], [], False
+    frames, costs, cost, taken = [], [], False, 0
     for i in range(num_steps):
         if i % _STEPS_PER_FRAME == 0:
             data.qpos[:] = np.asarray(env.engine_arrays(state)["qpos"])
@@ -78,14 +79,22 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
         if bool(state.done):
             break
         state = step(state, np.asarray(policy.sample(np.asarray(state.obs), random), np.float32))
-        cost = cost or bool(state.cost > 0)
+        cost, taken = cost or bool(state.cost > 0), taken + 1
     return Poses(
-        np.array(frames), model.geom_size[geoms, 0], np.array(costs), _STEPS_PER_FRAME * env.dt, axes == [0, 1]
+        frames=np.array(frames),
+        radii=model.geom_size[geoms, 0],
+        costs=np.array(costs),
+        num_steps=taken,
+        seconds_per_frame=_STEPS_PER_FRAME * env.dt,
+        above=axes == [0, 1],
     )
 
 
-def play_run(run: Run, seed: int, caption: str) -> str:
-    """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above."""
+def play_run(run: Run, seed: int, name: str, caption: str) -> str:
+    """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above.
+
+    `name` is unique on the page; the caption says whose episode it is.
+    """
     import envs
     from ccil_jax import runner
 
@@ -98,7 +107,7 @@ def play_run(run: Run, seed: int, caption: str) -> str:
         return (
             f"<figure>{figures.html_image(image, 'an episode from above')}<figcaption>{caption}</figcaption></figure>"
         )
-    return to_html(record_poses(env, policy), f"episode-{env.name}-{run.folder.resolve().name}", caption)
+    return to_html(record_poses(env, policy), name, caption)
 
 
 def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> np.ndarray:
@@ -126,6 +135,7 @@ def to_html(poses: Poses, name: str, caption: str) -> str:
     script = _SCRIPT.replace("DATA", json.dumps(content, separators=(",", ":")))
     return (
         f"<figure><canvas id='{html.escape(name)}' width=900 height=240></canvas>"
-        f"<figcaption>{html.escape(caption)} Lines are one metre apart; red: a cost is paid.</figcaption></figure>"
+        f"<figcaption>{html.escape(caption)} Its first {poses.num_steps} steps are "
+        "played; lines are one metre apart; red: a cost is paid.</figcaption></figure>"
         f"<script>{script}</script>"
     )

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ccil_jax.config import Config
 from experiments import run_folder
 from experiments.statistics import bootstrap_interval
-from experiments.summary import number, show
+from experiments.summary import BEYOND_ERROR, NO_INTERVAL, bounds, has_multiplier, marked, number, show
 from experiments.variants import Variant
 
 SCORES = ("episode_return", "episode_cost", "recovered_return", "relative_cost_violation")
@@ -30,30 +31,32 @@ def row(variant: Variant) -> Row:
         content[f"{name}_low"] = interval.low if interval else None
         content[f"{name}_high"] = interval.high if interval else None
         content[f"{name}_per_seed"] = values
+    content["violation_beyond_error"] = summary.get("violation_beyond_error")  # earlier versions do not say
     metrics = run_folder.read_metrics(variant.plan.folder)
     limit = summary["cost_limit"] if summary["expert_cost"] is None else summary["expert_cost"]
-    content |= multiplier_path(metrics, limit)
+    content |= multiplier_path(variant.plan.config, metrics, limit)
     rate, num_runs = summary["env_steps_per_second"], summary["runs_in_program"]
     return content | {"env_steps_per_second": rate, "runs_in_program": num_runs}
 
 
-def multiplier_path(metrics: Mapping[str, np.ndarray], limit: float | None) -> Row:
+def multiplier_path(config: Config, metrics: Mapping[str, np.ndarray], limit: float | None) -> Row:
     """Whether the multiplier wound up; metrics are [num_iterations, num_seeds], results means over seeds.
 
-    `final_multiplier` is its mean over the last tenth of the iterations, `windup` the share of all iterations in which
-    the cost was already below the limit while the multiplier was still above its final value. Methods without a
-    multiplier get None.
+    `final_multiplier` is its mean over the last tenth of the iterations, `windup` the share of the iterations with a
+    known cost in which the cost was already below the limit while the multiplier was still above its final value.
+    Methods without a multiplier get None, whatever they log.
     """
-    if "multiplier" not in metrics:
+    if not has_multiplier(config):
         return dict.fromkeys(("max_multiplier", "final_multiplier", "windup"))
     multiplier, episode_cost = metrics["multiplier"], metrics["episode_cost"]
     last = max(1, round(_FINAL * len(multiplier)))
     final = multiplier[-last:].mean(axis=0)
     above = (episode_cost < (np.inf if limit is None else limit)) & (multiplier > final)
+    known = ~np.isnan(episode_cost)
     return {
         "max_multiplier": float(multiplier.max(axis=0).mean()),
         "final_multiplier": float(final.mean()),
-        "windup": float(above.mean()),
+        "windup": float(above[known].mean()) if known.any() else None,
     }
 
 
@@ -69,7 +72,7 @@ def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], sect
     """The rows as a terminal table with these columns (name: heading); a rule where the value of `section` changes."""
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=title, title_justify="left", caption_justify="left")
     for name, heading in columns.items():
         table.add_column(heading, justify="left" if isinstance(rows[0][name], str) else "right")
     previous = rows[0].get(section)
@@ -78,13 +81,24 @@ def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], sect
             table.add_section()
             previous = content.get(section)
         table.add_row(*(_shown(content, name) for name in columns))
+    mark = f"*: {BEYOND_ERROR}" if any(content.get("violation_beyond_error") for content in rows) else ""
+    note = note_on_intervals(rows)
+    table.caption = "; ".join(filter(None, (mark, note and f"-: {note}"))) or None
     show(table)
+
+
+def note_on_intervals(rows: Sequence[Row]) -> str:
+    """What to say of rows without an interval; empty where all have one."""
+    missing = any(row[name] is not None and row[f"{name}_low"] is None for row in rows for name in SCORES)
+    return NO_INTERVAL if missing else ""
 
 
 def _shown(content: Row, name: str) -> str:
     value = content[name]
     if f"{name}_low" in content and value is not None:
-        return f"{number(value)} [{number(content[f'{name}_low'])}, {number(content[f'{name}_high'])}]"
+        shown = f"{number(value)} {bounds(content[f'{name}_low'], content[f'{name}_high'])}"
+        beyond = name == "relative_cost_violation" and content.get("violation_beyond_error")
+        return marked(shown, beyond)
     return value if isinstance(value, str) else str(value) if isinstance(value, int) else number(value)
 
 

@@ -7,6 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from experiments.statistics import known_mean
 from experiments.summary import number
 
 _SECONDS_BETWEEN_LINES = 10.0
@@ -15,22 +16,24 @@ _SECONDS_BETWEEN_LINES = 10.0
 class Display:
     """Shows return, cost against its limit, multiplier, speed and time left; use it as a context manager."""
 
-    def __init__(self, title: str, num_iterations: int, cost_limit: float | None) -> None:
+    def __init__(self, title: str, num_iterations: int, cost_limit: float | None, *, has_multiplier: bool) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        self._console = Console(file=sys.stderr, soft_wrap=True)
+        # Names of folders are shown as they are: no markup, no emoji.
+        self._console = Console(file=sys.stderr, soft_wrap=True, markup=False, emoji=False)
         self._cost_limit = cost_limit
+        self._has_multiplier = has_multiplier
         self._title = title
         self._started = self._last_line = time.monotonic()
         self._first_iteration: int | None = None
         self._bar: Any = None
         if self._console.is_terminal:
             columns = (
-                TextColumn("{task.description}"),
+                TextColumn("{task.description}", markup=False),
                 BarColumn(bar_width=None),
                 MofNCompleteColumn(),
-                TextColumn("{task.fields[status]}"),
+                TextColumn("{task.fields[status]}", markup=False),
                 TimeRemainingColumn(),
             )
             self._bar = Progress(*columns, console=self._console, expand=True)
@@ -55,12 +58,12 @@ class Display:
             self.message(f"{self._title} {progress.iteration}/{progress.num_iterations}  {status}{left}")
 
     def _status(self, progress: Any) -> str:
-        latest = {name: float(np.mean(rows[-1])) for name, rows in progress.metrics.items()}
+        latest = {name: float(known_mean(np.asarray(rows[-1]), axis=0)) for name, rows in progress.metrics.items()}
         limit = "" if self._cost_limit is None else f" / {number(self._cost_limit)}"
         if "episode_return" not in latest:  # behaviour cloning: it does not act while it learns
             return f"loss {number(latest['loss'])}  held out {number(latest['held_out_loss'])}"
         parts = [f"return {number(latest['episode_return'])}", f"cost {number(latest['episode_cost'])}{limit}"]
-        if "multiplier" in latest:
+        if self._has_multiplier:
             parts.append(f"lambda {number(latest['multiplier'])}")
         parts.append(f"{progress.env_steps_per_second:,.0f} steps/s")
         return "  ".join(parts)

@@ -12,9 +12,10 @@ import numpy as np
 
 from experiments import command_line, run_folder
 from experiments.command_line import Parser, UsageError
+from experiments.labels import distinct_names
 from experiments.run_folder import Run
 from experiments.statistics import bootstrap_interval
-from experiments.summary import number
+from experiments.summary import BEYOND_ERROR, bounds, marked, number
 
 _COLUMNS = (
     ("episode_return", "return"),
@@ -25,10 +26,9 @@ _COLUMNS = (
     ("cost_rate", "cost rate in training"),
 )
 _NOTE = (
-    "Return and cost are undiscounted sums over whole evaluation episodes of the final policy. Between seeds: "
-    "interquartile mean with its 95% bootstrap interval. Recovered return is 0% for a random policy and 100% for the "
-    "expert; violation counts what exceeds the expert's cost, relative to that cost; penalised return is the recovered "
-    "return less the violation in per cent."
+    "Runs: interquartile mean over seeds with its 95% bootstrap interval, [-] where there are too few seeds for one. "
+    "Seeds, expert and random policy: mean &plusmn; standard error over episodes. A dash: not known. Marked (*): a "
+    f"violation {html.escape(BEYOND_ERROR)}. What each number means is defined in docs/metrics.md of ccil_jax."
 )
 _STYLE = """
 :root { color-scheme: light; --ink: #22262b; --soft: #5b626c; --line: #e3e6ea; --accent: #0b6e99; }
@@ -42,6 +42,7 @@ div.wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
 th, td { padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 600; }
+td .beyond { color: #a0281f; font-weight: 600; cursor: help; }
 td small { color: var(--soft); } details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); }
 code { font-size: .86rem; background: #f4f6f8; padding: .05rem .3rem; white-space: pre-wrap; }
 """
@@ -53,7 +54,8 @@ class Entry:
 
     run: Run
     summary: dict[str, Any]
-    label: str
+    label: str  # no other run of this task has it
+    number: int  # no other run of this page has it
 
     @property
     def task(self) -> str:
@@ -81,20 +83,27 @@ def make_parser() -> Parser:
 
 
 def read_entries(folders: Sequence[Path]) -> list[Entry]:
-    """Reads the runs. Raises `UsageError` for a folder that is not a finished run."""
-    entries = []
+    """Reads the runs. Raises `UsageError` for a folder that is not a finished run, or is given twice."""
+    entries: list[Entry] = []
     for folder in folders:
+        if folder.resolve() in [e.run.folder.resolve() for e in entries]:
+            raise UsageError(f"RUN_DIR {folder}: the same folder twice; give each run once")
         if not folder.is_dir():
             raise UsageError(f"RUN_DIR {folder}: no such folder; give a folder that `train` wrote")
         run = run_folder.read_run(folder)
         if not (folder / "summary.json").is_file():
             raise UsageError(f"RUN_DIR {folder}: not finished (no summary.json); finish it with `train --resume`")
-        entries.append(Entry(run, run_folder.read_json(folder / "summary.json"), run.config.method))
-    pairs = [(e.task, e.label) for e in entries]
-    return [
-        dataclasses.replace(e, label=f"{e.label} ({e.run.folder.name})") if pairs.count((e.task, e.label)) > 1 else e
-        for e in entries
-    ]
+        entries.append(Entry(run, run_folder.read_json(folder / "summary.json"), run.config.method, len(entries)))
+    alike = ([other for other in entries if (other.task, other.label) == (e.task, e.label)] for e in entries)
+    return [_distinct(e, others) for e, others in zip(entries, alike, strict=True)]
+
+
+def _distinct(entry: Entry, alike: Sequence[Entry]) -> Entry:
+    """The entry, its folder's name in its label where others (`alike`, itself included) would have the same."""
+    if len(alike) == 1:
+        return entry
+    names = distinct_names([e.run.folder for e in alike])
+    return dataclasses.replace(entry, label=f"{entry.label} ({names[alike.index(entry)]})")
 
 
 def draw_tasks(entries: Sequence[Entry]) -> dict[str, bytes]:
@@ -137,10 +146,11 @@ def _task_section(
     from experiments import figures  # imports matplotlib
 
     yield f"<h2>{_text(task)}</h2>"
+    several = any(len(e.summary["per_seed"]) > 1 for e in entries)
+    seeds = "Thick: mean over seeds. Band: standard deviation. Thin: every seed. " if several else ""
     yield (
-        f"<figure>{figures.html_image(image, f'Return, cost and cost rate on {task}')}"
-        "<figcaption>Thick: mean over seeds. Band: standard deviation. Thin: every seed. "
-        "Dashed: mean of the demonstrations.</figcaption></figure>"
+        f"<figure>{figures.html_image(image, f'Learning curves on {task}')}<figcaption>{seeds}"
+        "Dashed: mean of the demonstrations, with its standard error where that is known.</figcaption></figure>"
     )
     yield _metrics_table(entries, seed)
     yield from (text for e in entries if player and (text := player(e)))
@@ -152,18 +162,31 @@ def _task_section(
 def _metrics_table(entries: Sequence[Entry], seed: int) -> str:
     rows = []
     for e in entries:
-        cells = [_text(e.label), str(e.summary["num_seeds"])]
+        cells = [_text(e.label), _text(str(e.summary["num_seeds"]))]
         for name, _ in _COLUMNS:
-            values = [row[name] for row in e.summary["per_seed"]]
-            cells.append("-" if None in values else _interval([np.array(values)], seed))
+            values = [row.get(name) for row in e.summary["per_seed"]]
+            text = "-" if None in values else _interval([np.array(values)], seed)
+            cells.append(_marked(text, name, e.summary.get("violation_beyond_error")))
         cells += [f"{e.summary['env_steps']:,}", _rate(e.summary["env_steps_per_second"])]
         rows.append(cells)
-    first = entries[0].summary
-    blanks = [""] * (len(_COLUMNS) - 2 + 2)
-    if first["expert_cost"] is not None:
-        rows.append(["expert", "", number(first["expert_return"]), number(first["expert_cost"]), *blanks])
-    rows.append(["random policy", "", number(first["random_return"]), number(first["random_cost"]), *blanks])
+    width = 2 + len(_COLUMNS) + 2
+    rows += [[*cells, *[""] * (width - len(cells))] for cells in _reference_rows(entries)]
     return _table(["", "seeds", *(title for _, title in _COLUMNS), "steps per seed", "steps/s"], rows)
+
+
+def _reference_rows(entries: Sequence[Entry]) -> Iterable[list[str]]:
+    """Label, no seeds, return and cost of what the runs are measured against: a row for each level that differs."""
+    for name, title in (("expert", "expert"), ("random", "random policy"), ("cost_limit", "cost limit")):
+        runs: dict[tuple[str, str], list[str]] = {}
+        for e in entries:
+            if name == "cost_limit":
+                cells = "", number(e.summary.get(name))
+            else:
+                cells = _with_error(e.summary, f"{name}_return"), _with_error(e.summary, f"{name}_cost")
+            runs.setdefault(cells, []).append(e.label)
+        for cells, labels in runs.items():
+            if set(cells) - {"", "-"}:
+                yield [title if len(runs) == 1 else _text(f"{title} of {', '.join(labels)}"), "", *cells]
 
 
 def _across_tasks(entries: Sequence[Entry], seed: int) -> str:
@@ -171,9 +194,9 @@ def _across_tasks(entries: Sequence[Entry], seed: int) -> str:
     rows = []
     for method in dict.fromkeys(e.run.config.method for e in entries):
         chosen = [e for e in entries if e.run.config.method == method]
-        cells = [method, str(len({e.task for e in chosen}))]
+        cells = [_text(method), str(len({e.task for e in chosen}))]
         for name in ("recovered_return", "relative_cost_violation", "penalized_return"):
-            strata = [np.array([row[name] for row in e.summary["per_seed"]], np.float64) for e in chosen]
+            strata = [np.array([row.get(name) for row in e.summary["per_seed"]], np.float64) for e in chosen]
             cells.append(_interval(strata, seed) if all(np.isfinite(s).all() for s in strata) else "-")
         rows.append(cells)
     titles = ["", "tasks", "recovered return, %", "relative cost violation", "penalised return, %"]
@@ -182,11 +205,30 @@ def _across_tasks(entries: Sequence[Entry], seed: int) -> str:
 
 def _seeds_table(entries: Sequence[Entry]) -> str:
     rows = [
-        [_text(f"{e.label}, seed {row['seed']}"), *(number(row[name]) for name, _ in _COLUMNS)]
+        [_text(f"{e.label}, seed {row['seed']}"), *(_seed_cell(row, name) for name, _ in _COLUMNS)]
         for e in entries
         for row in e.summary["per_seed"]
     ]
     return _table(["", *(title for _, title in _COLUMNS)], rows)
+
+
+def _seed_cell(row: Mapping[str, Any], name: str) -> str:
+    text = _with_error(row, name) if name in ("episode_return", "episode_cost") else number(row.get(name))
+    return _marked(text, name, row.get("violation_beyond_error"))
+
+
+def _with_error(content: Mapping[str, Any], name: str) -> str:
+    """A mean and its standard error, which earlier versions did not write."""
+    if content.get(name) is None:
+        return "-"
+    return f"{number(content[name])} <small>&plusmn; {number(content.get(f'{name}_standard_error'))}</small>"
+
+
+def _marked(text: str, name: str, beyond_error: bool | None) -> str:
+    """The text of a cell; a violation that is no scatter of the demonstrations is marked."""
+    if name != "relative_cost_violation" or not beyond_error:
+        return text
+    return f"<span class=beyond title='{_text(BEYOND_ERROR)}'>{marked(text, beyond_error)}</span>"
 
 
 def _differences(entries: Sequence[Entry]) -> str:
@@ -202,7 +244,7 @@ def _differences(entries: Sequence[Entry]) -> str:
             f"physics {_text(facts['physics'])}, device {_text(facts['device']['kind'])}, "
             f"commit {_text(str(facts['git_commit']))}, {_text(versions)}"
             + (
-                f", demonstrations sha256 {_text(demos['sha256'])}, {demos['num_episodes']} trajectories"
+                f", demonstrations sha256 {_text(demos['sha256'])}, {_text(str(demos['num_episodes']))} trajectories"
                 if demos
                 else ""
             )
@@ -213,7 +255,7 @@ def _differences(entries: Sequence[Entry]) -> str:
 
 def _interval(strata: Sequence[np.ndarray], seed: int) -> str:
     interval = bootstrap_interval(strata, seed=seed)
-    return f"{number(interval.value)} <small>[{number(interval.low)}, {number(interval.high)}]</small>"
+    return f"{number(interval.value)} <small>{bounds(interval.low, interval.high)}</small>"
 
 
 def _rate(steps_per_second: float | None) -> str:
@@ -231,13 +273,21 @@ def _text(value: str) -> str:
 
 
 def animate(entry: Entry) -> str:
-    """The HTML of an episode of a run's best seed, or an empty string for a run without checkpoints."""
+    """The HTML of an episode of the seed with the highest return, or an empty string for a run without checkpoints."""
     if not (entry.run.folder / "checkpoints").is_dir():
         return ""
     from experiments import animation  # imports JAX: only where an episode is asked for
 
-    best = max(entry.summary["per_seed"], key=lambda row: row["episode_return"])["seed"]
-    return animation.play_run(entry.run, best, f"{entry.label}, seed {best}.")
+    best, caption = choose_seed(entry)
+    return animation.play_run(entry.run, best, f"episode-{entry.number}", caption)
+
+
+def choose_seed(entry: Entry) -> tuple[int, str]:
+    """The seed whose episode is shown, and a caption that says why."""
+    rows = entry.summary["per_seed"]
+    best = max(rows, key=lambda row: -np.inf if row["episode_return"] is None else row["episode_return"])["seed"]
+    why = f", which has the highest mean return of {len(rows)} seeds" if len(rows) > 1 else ""
+    return best, f"One episode of {entry.label}, seed {best}{why}."
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -253,7 +303,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"page    {path}")
     if arguments.figures:
         for task, image in images.items():
-            figure = arguments.figures / f"{task}.png"
+            figure = arguments.figures / f"{Path(task).name}.png"  # a name from a file does not choose the folder
             figure.write_bytes(image)
             print(f"figure  {figure}")
 

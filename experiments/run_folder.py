@@ -18,6 +18,7 @@ import numpy as np
 from ccil_jax.config import Config
 from ccil_jax.versions import versions
 from experiments.command_line import UsageError
+from experiments.statistics import known_mean
 
 METRICS = (  # order of the columns; a method leaves out those that it lacks
     "env_steps",
@@ -52,6 +53,7 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "held_out_loss",
     "skipped_updates",
 )
+EPISODE_METRICS = ("episode_return", "episode_cost", "episode_length")  # unknown before an episode has ended
 _FACTS = frozenset(
     {"task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations"}
     | {"expert_return", "expert_cost", "expert_length"}
@@ -142,7 +144,10 @@ def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None
 
 
 def read_metrics(folder: Path) -> dict[str, np.ndarray]:
-    """metrics.csv as `{name: [num_iterations, num_seeds]}`. Raises `UsageError` if it is missing or ragged."""
+    """metrics.csv as `{name: [num_iterations, num_seeds]}`; NaN where a value is unknown.
+
+    Raises `UsageError` if the file is missing or ragged.
+    """
     path = folder / "metrics.csv"
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -153,12 +158,25 @@ def read_metrics(folder: Path) -> dict[str, np.ndarray]:
         shaped = table.reshape(-1, num_seeds, len(names))
     except (OSError, StopIteration, ValueError, IndexError):
         raise UsageError(f"{path}: missing, empty or damaged; give a run folder with at least one iteration") from None
-    return {name: shaped[:, :, i] for i, name in enumerate(names) if name not in ("iteration", "seed")}
+    metrics = {name: shaped[:, :, i] for i, name in enumerate(names) if name not in ("iteration", "seed")}
+    return _without_placeholders(metrics)
+
+
+def _without_placeholders(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """NaN for the numbers that earlier versions wrote of episodes before a seed's first one had ended."""
+    if "episodes_finished" not in metrics:
+        return metrics
+    known = np.cumsum(metrics["episodes_finished"], axis=0) > 0
+    return {
+        name: np.where(known, values, math.nan) if name in EPISODE_METRICS else values
+        for name, values in metrics.items()
+    }
 
 
 class MetricsWriter:
     """Writes metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager.
 
+    A value that is unknown (NaN) is an empty field of the file, and is left out of the events.
     `begin` first: the file then holds exactly the iterations that the run goes on from, whatever a killed process left.
     """
 
@@ -182,10 +200,11 @@ class MetricsWriter:
     def write(self, iteration: int, metrics: Mapping[str, np.ndarray]) -> None:
         """Adds rows `[chunk, num_seeds]`; `iteration` is the number of iterations finished with the chunk's last."""
         with self.path.open("a", newline="", encoding="utf-8") as file:
-            rows = self._append(file, metrics, first=iteration - len(metrics["env_steps"]))
+            first = iteration - len(metrics["env_steps"])
+            rows = self._append(file, metrics, first)
         try:
-            for row in rows:
-                self._write_events(row)
+            for number, row in enumerate(rows, first + 1):
+                self._write_events(number, row)
             self._events.flush()
         except OSError as error:  # tensorboardX does not name the file
             raise OSError(error.errno, error.strerror, str(self.path.parent)) from error
@@ -201,15 +220,19 @@ class MetricsWriter:
             writer.writerows([number, s, *(_text(x) for x in values)] for s, values in enumerate(row))
         return rows
 
-    def _write_events(self, row: np.ndarray) -> None:
+    def _write_events(self, iteration: int, row: np.ndarray) -> None:
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
 
-        steps, values = int(row[0, self._names.index("env_steps")]), []
-        for i, name in enumerate(self._names):
-            if name != "env_steps":
-                values.append(Summary.Value(tag=f"mean/{name}", simple_value=row[:, i].mean()))
-                values += [Summary.Value(tag=f"seed_{s}/{name}", simple_value=x) for s, x in enumerate(row[:, i])]
+        # Behaviour cloning takes no environment steps: its axis is the number of passes.
+        steps = int(row[0, self._names.index("env_steps")]) or iteration
+        means = known_mean(row, axis=0)
+        values = [
+            Summary.Value(tag=f"{group}/{name}", simple_value=numbers[i])
+            for i, name in enumerate(self._names)
+            for group, numbers in (("mean", means), *((f"seed_{s}", numbers) for s, numbers in enumerate(row)))
+            if name != "env_steps" and not math.isnan(numbers[i])
+        ]
         self._events.write_event(Event(wall_time=time.time(), step=steps, summary=Summary(value=values)))
 
     def __enter__(self) -> Self:
@@ -223,5 +246,7 @@ class MetricsWriter:
 
 
 def _text(value: float) -> str:
-    """Nine digits tell float32 numbers apart; counters are written in full."""
+    """Nine digits tell float32 numbers apart; counters are written in full, and nothing for what is unknown."""
+    if math.isnan(value):
+        return ""
     return str(int(value)) if value.is_integer() and abs(value) < 2**53 else f"{value:.9g}"

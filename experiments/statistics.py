@@ -1,21 +1,24 @@
 """Aggregates over seeds: interquartile mean with a stratified bootstrap interval (Agarwal et al. 2021). NumPy only.
 
-Our own sixty lines because rliable cannot be imported beside pandas 3.
+Our own few lines because rliable cannot be imported beside pandas 3. What the numbers mean: docs/metrics.md.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+
+MIN_SEEDS = 3  # of an interval: resamples of one or two values say next to nothing of what further seeds would do
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """A statistic and the percentile interval of its bootstrap distribution."""
+    """A statistic and the percentile interval of its bootstrap distribution; None where there are too few values."""
 
     value: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 def interquartile_mean(values: np.ndarray) -> float:
@@ -35,7 +38,8 @@ def bootstrap_interval(
 ) -> Interval:
     """`statistic` of all values and its percentile interval; values are resampled within each stratum (task).
 
-    `strata` is one array of values (one per seed) per task. The seed is fixed, so a report can be made again.
+    `strata` is one array of values (one per seed) per task. The seed is fixed, so a report can be made again. Where a
+    stratum has fewer than `MIN_SEEDS` values there is a value, but no interval.
     Raises `ValueError` for an empty stratum or a value that is not finite.
     """
     arrays = [np.asarray(stratum, np.float64).ravel() for stratum in strata]
@@ -43,10 +47,28 @@ def bootstrap_interval(
         raise ValueError("every stratum needs at least one value")
     if not all(np.isfinite(a).all() for a in arrays):
         raise ValueError("values must be finite")
+    value = statistic(np.concatenate(arrays))
+    if min(a.size for a in arrays) < MIN_SEEDS:
+        return Interval(value, None, None)
     random = np.random.default_rng(seed)
     draws = [a[random.integers(0, a.size, (num_resamples, a.size))] for a in arrays]
     resampled = np.concatenate(draws, axis=1)
     estimates = np.array([statistic(row) for row in resampled])
     tail = 100 * (1 - confidence) / 2
     low, high = np.percentile(estimates, [tail, 100 - tail])
-    return Interval(statistic(np.concatenate(arrays)), float(low), float(high))
+    return Interval(value, float(low), float(high))
+
+
+def known_mean(values: np.ndarray, axis: int) -> np.ndarray:
+    """Mean over an axis of the values that are known (not NaN); NaN where none is."""
+    return np.asarray(np.ma.filled(_known(values).mean(axis=axis), np.nan))
+
+
+def known_deviation(values: np.ndarray, axis: int) -> np.ndarray:
+    """Standard deviation over an axis of the values that are known (not NaN); NaN where fewer than two are."""
+    deviation = np.ma.filled(_known(values).std(axis=axis), np.nan)
+    return np.where((~np.isnan(values)).sum(axis=axis) > 1, deviation, np.nan)
+
+
+def _known(values: np.ndarray) -> np.ma.MaskedArray[Any, Any]:
+    return np.ma.masked_array(values, np.isnan(values))

@@ -98,7 +98,12 @@ def execute_together(
     title = f"{first.config.method} {first.task}"
     with (
         files.hold(checkpoint_dir / ".run.lock"),
-        Display(title, first.config.num_iterations, first.cost_limit) as display,
+        Display(
+            title,
+            first.config.num_iterations,
+            first.cost_limit,
+            has_multiplier=summary.has_multiplier(first.config),
+        ) as display,
         Interruption() as interruption,
     ):
         several = f"{len(plans)} configurations of " if len(plans) > 1 else ""
@@ -243,8 +248,7 @@ def _facts(plan: Plan, env: Any) -> dict[str, Any]:
         "num_seeds": plan.num_seeds,
         "eval_episodes": plan.eval_episodes,
         "demonstrations": demonstrations,
-        "expert_return": plan.demonstrations.mean_episode_return if plan.demonstrations else None,
-        "expert_cost": plan.demonstrations.mean_episode_cost if plan.demonstrations else None,
+        **summary.expert_levels(plan.demonstrations),
         "expert_length": plan.demonstrations.mean_episode_length if plan.demonstrations else None,
         "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
     }
@@ -258,16 +262,13 @@ def _finish(
     evaluated: "Evaluation",
     random: "Evaluation",
 ) -> dict[str, Any]:
-    """Writes summary and figures, prints the table, returns the summary."""
+    """Writes figures and summary, prints the table, returns the summary.
+
+    The summary is the last file to be written: its presence says that the run folder is complete.
+    """
     from experiments import figures  # imports matplotlib: no argument error should wait for it
 
-    reference = summary.Reference(
-        expert_return=plan.demonstrations.mean_episode_return if plan.demonstrations else None,
-        expert_cost=plan.demonstrations.mean_episode_cost if plan.demonstrations else None,
-        random_return=float(np.mean(random.episode_return)),
-        random_cost=float(np.mean(random.episode_cost)),
-        cost_limit=plan.config.cost_limit,
-    )
+    reference = summary.make_reference(summary.expert_levels(plan.demonstrations), random, plan.config.cost_limit)
     metrics = run_folder.read_metrics(plan.folder)
     rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
@@ -279,14 +280,15 @@ def _finish(
         "evaluation": {"simulator": "ours", "num_episodes": plan.eval_episodes, "deterministic": False},
         "per_seed": rows,
         "aggregate": aggregate,
+        "violation_beyond_error": summary.mean_violation_beyond_error(rows, reference),  # of the mean over seeds
         "env_steps": result.env_steps,
         "env_steps_per_second": rate,  # of all runs that shared the program
         "runs_in_program": num_runs,
         "wall_seconds": result.wall_seconds,
         "compile_seconds": result.compile_seconds,
     }
-    run_folder.write_json(plan.folder / "summary.json", content)
     figure = figures.draw_run(plan.folder)
+    run_folder.write_json(plan.folder / "summary.json", content)
     title = f"{plan.config.method} on {plan.task}, {plan.eval_episodes} evaluation episodes per seed"
     summary.print_table(title, rows, aggregate, reference)
     print(f"figure  {figure}\nrun     {plan.folder}")

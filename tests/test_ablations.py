@@ -1,13 +1,15 @@
 """Ablations: every answer is a configuration that runs, few programs, and figures that are what they are called."""
 
+import csv
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ccil_jax.config import METHOD_NAMES, Config, validate
-from experiments import ablations, comparison, comparison_figures, variants
+from experiments import ablations, comparison, comparison_figures, run_folder, variants
 from experiments.ablations import QUESTIONS
 from experiments.comparison import Row, multiplier_path
 
@@ -66,11 +68,21 @@ def test_the_path_of_a_multiplier() -> None:
     steady = np.full(20, 0.5)
     cost = np.array([30.0] * 6 + [20.0] * 14)
     metrics = {"multiplier": np.stack([wound, steady], 1), "episode_cost": np.stack([cost, cost], 1)}
-    path = multiplier_path(metrics, limit=25.0)
+    path = multiplier_path(Config(method="ccil"), metrics, limit=25.0)
     assert path["max_multiplier"] == (4.0 + 0.5) / 2
     assert path["final_multiplier"] == (1.0 + 0.5) / 2
     assert path["windup"] == pytest.approx((2 + 10) / 20 / 2)  # below the limit from 6 on, above 1 up to 17
-    assert set(multiplier_path({}, limit=25.0).values()) == {None}
+    metrics["episode_cost"][:2] = np.nan  # before the first episode has ended
+    assert multiplier_path(Config(method="ccil"), metrics, limit=25.0)["windup"] == pytest.approx((2 + 10) / 18 / 2)
+    metrics["episode_cost"][:] = np.nan
+    assert multiplier_path(Config(method="ccil"), metrics, limit=25.0)["windup"] is None
+
+
+@pytest.mark.parametrize("changes", [{"method": "gail"}, {"method": "ccil", "multiplier_update": "optimal"}])
+def test_a_method_without_a_multiplier_has_no_path(changes: dict[str, str]) -> None:
+    """Whatever it logs."""
+    metrics = {"multiplier": np.zeros((20, 2)), "episode_cost": np.ones((20, 2))}
+    assert set(multiplier_path(Config(**changes), metrics, limit=25.0).values()) == {None}
 
 
 def row(question: str, answer: str, level: float, rate: float | None, num_runs: int = 3) -> Row:
@@ -101,4 +113,36 @@ def test_table_and_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     printed = capsys.readouterr().out
     assert "97.00 [95.00, 99.00]" in printed
     comparison_figures.draw_groups(tmp_path / "t.png", {"a": rows[:2], "b": rows[2:]}, "answer", "t")
+    assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_few_seeds_have_no_interval_and_violations_are_marked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the run folder to table, CSV file and figure. The second is of an earlier version, and lacks a score."""
+    rows = []
+    for name, values, marks in (("[red]", [2.0, 4.0], {"violation_beyond_error": True}), ("$_{x$", [1.0, None], {})):
+        folder = tmp_path / name
+        folder.mkdir()
+        seeds = [dict.fromkeys(comparison.SCORES, value) for value in values]
+        levels = {"expert_cost": 30.0, "cost_limit": None, "env_steps": 9, "env_steps_per_second": None}
+        run_folder.write_json(folder / "summary.json", {"per_seed": seeds, **levels, "runs_in_program": 2, **marks})
+        with run_folder.MetricsWriter(folder) as writer:
+            writer.begin({"env_steps": np.ones((1, 2)), "multiplier": np.zeros((1, 2))})
+        plan = SimpleNamespace(folder=folder, task="Swimmer", num_seeds=2, config=Config(method="cvag"))
+        rows.append(comparison.row(SimpleNamespace(name=name, plan=plan)))
+    comparison.write_csv(tmp_path / "t.csv", rows)
+    with (tmp_path / "t.csv").open(newline="") as file:
+        first, second = csv.DictReader(file)
+    scores = [first[f"relative_cost_violation{x}"] for x in ("", "_low", "_high", "_per_seed")]
+    assert scores == ["3", "", "", "2 4"]
+    assert (first["violation_beyond_error"], second["violation_beyond_error"]) == ("True", "")
+    assert (first["final_multiplier"], second["relative_cost_violation"]) == ("", "")
+    columns = {"variant": "variant", "episode_cost": "cost", "relative_cost_violation": "violation"}
+    comparison.print_rows("t", columns, rows)
+    printed = capsys.readouterr().out
+    cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in printed.splitlines() if "│" in line]
+    assert cells == [["[red]", "3.00 [-]", "3.00 [-] *"], ["$_{x$", "-", "-"]]
+    assert "*: beyond the demonstrations' error; -: no interval below 3 seeds" in " ".join(printed.split())
+    comparison_figures.draw_groups(tmp_path / "t.png", {"$_{x$": rows}, "variant", "$_{x$")
     assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")

@@ -1,9 +1,11 @@
 """The page: self-contained, every seed on it, figures that decode; and the episode that it plays."""
 
 import base64
+import errno
 import html.parser
 import io
 import re
+import types
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,15 +13,28 @@ from typing import Any
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.patches import Rectangle
 
 from ccil_jax.config import Config
-from experiments import benchmark, figures, report, run_folder
+from experiments import benchmark, figures, labels, report, run_folder, summary, training
+from experiments.command_line import UsageError
+from experiments.progress import Display
 from experiments.summary import Reference, aggregate_scores, scores
 
+ERRORS = {"expert_return_standard_error": 2.0, "expert_cost_standard_error": 1.5}
 
-def make_run(folder: Path, method: str, task: str = "Swimmer", level: float = 50.0, **config: Any) -> Path:
-    """A finished run of three seeds whose returns are level, level + 10 and level + 20."""
-    folder.mkdir()
+
+def make_run(
+    folder: Path,
+    method: str,
+    task: str = "Swimmer",
+    level: float = 50.0,
+    num_seeds: int = 3,
+    errors: dict[str, float] = ERRORS,
+    **config: Any,
+) -> Path:
+    """A finished run whose seeds return level, level + 10 and so on; without `errors` as earlier versions wrote it."""
+    folder.mkdir(parents=True)
     facts = {
         "task": task,
         "physics": "native",
@@ -27,40 +42,45 @@ def make_run(folder: Path, method: str, task: str = "Swimmer", level: float = 50
         "preset": "paper",
         "command": f"train <{method}>",
         "seed": 0,
-        "num_seeds": 3,
+        "num_seeds": num_seeds,
         "eval_episodes": 50,
         "device": {"kind": "cpu"},
         "demonstrations": None,
         "expert_return": 100.0,
         "expert_cost": 30.0,
         "expert_length": 1000.0,
+        **errors,
     }
     run_folder.write_config(folder, Config(method=method, **config), facts)
-    steps = np.arange(1, 6)[:, None] * np.ones((1, 3))
+    steps = np.arange(1, 6)[:, None] * np.ones((1, num_seeds))
     rows = {
         "env_steps": 6000 * steps,
-        "episode_return": 10 * steps + np.arange(3),
+        "episode_return": 10 * steps + np.arange(num_seeds),
         "episode_cost": 5 * steps,
         "cost_rate": steps / 100,
-        "episodes_finished": np.array([0, 2, 2, 2, 2])[:, None] * np.ones((1, 3)),
+        "episodes_finished": np.array([0, 2, 2, 2, 2])[:, None] * np.ones((1, num_seeds)),
     }
+    if method == "bc":
+        rows = {"env_steps": 0 * steps, "loss": 1 / steps, "held_out_loss": 2 / steps}
     with run_folder.MetricsWriter(folder) as writer:
         writer.write(5, rows)
-    reference = Reference(expert_return=100.0, expert_cost=30.0, random_return=0.0, random_cost=1.0, cost_limit=None)
-    seeds = [
+    levels: dict[str, Any] = {"expert_return": 100.0, "expert_cost": 30.0, "random_return": 0.0, "random_cost": 1.0}
+    reference = Reference(**levels, cost_limit=None, **errors)
+    seeds: list[dict[str, Any]] = [
         {"seed": s, **scores(level + 10 * s, 33.0, reference), "cost_rate": 0.05, "episode_length": 1000.0}
-        for s in range(3)
+        for s in range(num_seeds)
     ]
+    if errors:
+        for row in seeds:
+            row |= {"episode_return_standard_error": 0.5, "episode_cost_standard_error": 0.25}
+        levels |= {"violation_beyond_error": summary.mean_violation_beyond_error(seeds, reference), **errors}
     content = {
         "task": task,
         "method": method,
-        "num_seeds": 3,
+        "num_seeds": num_seeds,
         "per_seed": seeds,
         "aggregate": aggregate_scores(seeds),
-        "expert_return": 100.0,
-        "expert_cost": 30.0,
-        "random_return": 0.0,
-        "random_cost": 1.0,
+        **levels,
         "env_steps": 30_000,
         "env_steps_per_second": 1234.5,
     }
@@ -112,8 +132,12 @@ def test_page_is_self_contained_and_shows_every_seed(tmp_path: Path) -> None:
     assert not re.search(r"https?://", text)
     rows = " | ".join(page.cells)
     assert "60.00 [50.00, 70.00]" in rows  # interquartile mean of 50, 60, 70 and the range that resamples can reach
-    for label in ("malm, seed 2 | 70.00 | 33.00 | 70.00 | 0.10 | 60.00", "gail, seed 2 | 90.00", "expert |  | 100.0"):
-        assert label in rows
+    assert "malm, seed 2 | 70.00 ± 0.50 | 33.00 ± 0.25 | 70.00 | 0.10 * | 60.00" in rows
+    assert "gail, seed 2 | 90.00 ±" in rows
+    assert "expert |  | 100.0 ± 2.00 | 30.00 ± 1.50 |" in rows
+    assert "random policy |  | 0.00 ± - | 1.00 ± - |" in rows
+    assert text.count("title='beyond the demonstrations&#x27; error'") == 2 + 6  # runs and seeds
+    assert "docs/metrics.md" in text
     assert "max_kl | 0.01 | 0.02" in rows
     assert "train &lt;malm&gt;" in text
     assert "Across tasks" not in text
@@ -127,10 +151,56 @@ def test_runs_of_several_tasks_are_also_pooled(tmp_path: Path) -> None:
     assert len(page.addresses) == 2
 
 
+def test_a_page_of_an_earlier_versions_run_shows_dashes_for_what_it_lacks(tmp_path: Path) -> None:
+    text = make_page([make_run(tmp_path / "a", "malm", num_seeds=2, errors={})])
+    rows = " | ".join(Page(text).cells)
+    assert "malm | 2 | 55.00 [-] | 33.00 [-] | 55.00 [-] | 0.10 [-] |" in rows
+    assert "malm, seed 1 | 60.00 ± - | 33.00 ± - | 60.00 | 0.10 | 50.00" in rows
+    assert "expert |  | 100.0 ± - | 30.00 ± - |" in rows
+    assert "class=beyond" not in text
+
+
+def test_levels_that_differ_between_runs_have_rows_of_their_own(tmp_path: Path) -> None:
+    folders = [make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "lgail", errors={})]
+    content = run_folder.read_json(folders[1] / "summary.json")
+    run_folder.write_json(folders[1] / "summary.json", content | {"cost_limit": 25.0, "random_cost": 2.0})
+    rows = " | ".join(Page(make_page(folders)).cells)
+    assert "random policy of malm |  | 0.00 ± - | 1.00 ± - |" in rows
+    assert "random policy of lgail |  | 0.00 ± - | 2.00 ± - |" in rows
+    assert "cost limit of lgail |  |  | 25.00 |" in rows
+    assert "cost limit of malm" not in rows
+
+
 def test_two_runs_of_one_method_are_told_apart(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "malm")]
     assert [e.label for e in report.read_entries(folders)] == ["malm (a)", "malm (b)"]
     assert "All fields are equal" in make_page(folders)
+
+
+def test_folders_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folders = [make_run(tmp_path / name, "malm") for name in ("a/x/run", "b/x/run", "c/run", "d")]
+    monkeypatch.chdir(folders[0])
+    entries = report.read_entries([Path(), *folders[1:]])
+    assert [e.label for e in entries] == [f"malm ({name})" for name in ("a/x/run", "b/x/run", "c/run", "d")]
+    with pytest.raises(UsageError, match=r"RUN_DIR .*run: the same folder twice; give each run once"):
+        report.read_entries([Path(), folders[0]])
+    assert labels.distinct_names([Path("/run"), Path("/a/run")]) == ["/run", "a/run"]
+
+
+@pytest.mark.parametrize("name", ["$_{x$", "cost$5$", "a\\$b", "_hidden", "[red]x", "<i>", "tab\t"])
+def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
+    """As a run's label, in the legend, and as a task, in the title; and on the page."""
+    folders = [make_run(tmp_path / name, "malm", task=name), make_run(tmp_path / "b", "malm", task=name)]
+    entries = report.read_entries(folders)
+    curves = [figures.Curve(name, run_folder.read_metrics(folders[0]), {}, None)]
+    figure = figures.draw_panels(curves, name, ["cost_rate"])
+    assert figures.png(figure).startswith(b"\x89PNG")
+    shown = [figure.legends[0].get_texts()[0], figure._suptitle]
+    for text, expected in zip(shown, (name, f"{name}: mean and standard deviation over 3 seeds"), strict=True):
+        drawn, is_mathematics = text._preprocess_math(text.get_text())
+        assert not is_mathematics
+        assert drawn == expected.replace("\t", "?")
+    assert f"malm ({name}), seed 0" in " | ".join(Page(report.page(entries, {name: b""})).cells)
 
 
 def test_report_writes_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -161,6 +231,118 @@ def test_curves_start_with_the_first_finished_episode(tmp_path: Path) -> None:
     np.testing.assert_allclose(mean["Cost rate"], [0.01, 0.02, 0.03, 0.04, 0.05])
     levels = {axes.get_title(loc="left"): axes.lines[-1].get_ydata()[0] for axes in figure.axes}  # type: ignore[index]
     assert levels == {"Return": 100.0, "Cost per episode": 30.0, "Cost rate": 0.03}
+    spans = [[patch for patch in axes.patches if isinstance(patch, Rectangle)] for axes in figure.axes]
+    bounds = [[(patch.get_y(), patch.get_y() + patch.get_height()) for patch in patches] for patches in spans]
+    assert bounds == [[(98.0, 102.0)], [(28.5, 31.5)], []]  # the standard errors; that of the rate is not known
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        *("malm", "mean of the demonstrations", "its standard error")
+    ]
+
+
+def test_curves_of_single_seeds_and_of_none_that_is_known() -> None:
+    """One seed has no deviation, and a run in which no episode has ended no curve."""
+    nan = np.nan
+    values = np.array([[nan, nan], [nan, 4.0], [2.0, 6.0]])
+    metrics = {"env_steps": np.array([[10, 10], [20, 20], [30, 30]]), "episode_return": values}
+    figure = figures.draw_panels([figures.Curve("malm", metrics, {}, None)], "Swimmer")
+    np.testing.assert_array_equal(figure.axes[0].lines[-1].get_ydata(), [nan, 4.0, 4.0])  # of the seeds that have one
+    metrics = {"env_steps": metrics["env_steps"][:, :1], "episode_return": np.full((3, 1), nan)}
+    figure = figures.draw_panels([figures.Curve("malm", metrics, {}, None)], "Swimmer")
+    assert np.isnan(np.asarray(figure.axes[0].lines[-1].get_ydata())).all()
+    assert figure.get_suptitle() == "Swimmer: one seed"
+    assert figures.png(figure).startswith(b"\x89PNG")
+
+
+def test_cloning_is_drawn_against_passes_beside_runs_that_take_steps(tmp_path: Path) -> None:
+    folders = [make_run(tmp_path / "a", "gail"), make_run(tmp_path / "b", "bc")]
+    figure = figures.draw_panels([figures.read_curve(folder) for folder in folders], "Swimmer")
+    drawn = {axes.get_title(loc="left"): axes for axes in figure.axes}
+    assert {title: axes.get_xlabel() for title, axes in drawn.items()} == {
+        **dict.fromkeys(("Return", "Cost per episode", "Cost rate"), "iterations of 6,000 steps"),
+        **dict.fromkeys(("Loss, nats", "Loss on held-out steps, nats"), "passes over the demonstrations"),
+    }
+    np.testing.assert_array_equal(drawn["Loss, nats"].lines[-1].get_xdata(), [1, 2, 3, 4, 5])
+    assert drawn["Loss, nats"].lines[-1].get_color() == figures.COLORS[1]
+    both = [{"env_steps": steps * np.ones((4, 1)), "loss": np.ones((4, 1))} for steps in (0, 7)]
+    panels = figures.panels_of([figures.Curve("x", metrics, {}, None) for metrics in both])  # one metric of both kinds
+    assert [(panel.metric, panel.by_passes, list(panel.curves)) for panel in panels] == [
+        ("loss", False, [1]),
+        ("loss", True, [0]),
+    ]
+
+
+def test_the_episode_shown_is_said_to_be_of_the_best_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from experiments import animation
+
+    folders = [make_run(tmp_path / "a/run", "malm"), make_run(tmp_path / "b/run", "malm", num_seeds=1)]
+    content = run_folder.read_json(folders[0] / "summary.json")
+    content["per_seed"][2]["episode_return"] = None  # was not finite
+    run_folder.write_json(folders[0] / "summary.json", content)
+    for folder in folders:
+        (folder / "checkpoints").mkdir()
+    calls: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(animation, "play_run", lambda run, *more: calls.append(more))
+    for entry in report.read_entries(folders):
+        report.animate(entry)
+    assert calls == [
+        (1, "episode-0", "One episode of malm (a/run), seed 1, which has the highest mean return of 3 seeds."),
+        (0, "episode-1", "One episode of malm (b/run), seed 0."),
+    ]
+
+
+def progress(**metrics: list[float]) -> Any:
+    """Two seeds' latest row."""
+    return types.SimpleNamespace(
+        iteration=2,
+        num_iterations=2,
+        compile_seconds=1.0,
+        env_steps_per_second=1000.0,
+        metrics={name: np.array([values]) for name, values in metrics.items()},
+    )
+
+
+@pytest.mark.parametrize("has_multiplier", [True, False])
+def test_progress_says_nothing_of_what_is_unknown(has_multiplier: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    nan = np.nan
+    display = Display("[red]gail[/red] :smile:", 2, 25.0, has_multiplier=has_multiplier)
+    display.update(progress(episode_return=[nan, nan], episode_cost=[nan, 4.0], multiplier=[0.0, 0.0]))
+    line = capsys.readouterr().err.splitlines()[-1]
+    multiplier = "lambda 0.00  " if has_multiplier else ""
+    assert line == f"[red]gail[/red] :smile: 2/2  return -  cost 4.00 / 25.00  {multiplier}1,000 steps/s"
+
+
+class Episodes(types.SimpleNamespace):
+    """Stands in for an evaluation."""
+
+
+def test_the_summary_is_the_last_file_of_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its presence says that the run is complete."""
+    folder = make_run(tmp_path / "a", "gail", num_seeds=2)
+    (folder / "summary.json").unlink()
+    plan: Any = types.SimpleNamespace(
+        folder=folder, config=Config(method="gail"), task="Swimmer", num_seeds=2, eval_episodes=2, demonstrations=None
+    )
+    result: Any = types.SimpleNamespace(env_steps=30_000, wall_seconds=1.0, compile_seconds=1.0)
+    values = np.array([[1.0, 3.0], [5.0, 9.0]])
+    evaluated: Any = Episodes(episode_return=values, episode_cost=values, episode_length=values)
+    random: Any = Episodes(episode_return=values[:1], episode_cost=values[:1], episode_length=values[:1])
+
+    def no_space(path: Path) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(figures, "draw_run", no_space)
+        with pytest.raises(OSError, match="No space left"):
+            training._finish(plan, result, None, 2, evaluated, random)
+    assert not (folder / "summary.json").exists()
+    training._finish(plan, result, None, 2, evaluated, random)
+    content = run_folder.read_json(folder / "summary.json")
+    assert content["expert_cost_standard_error"] is content["violation_beyond_error"] is None
+    assert (content["random_return_standard_error"], content["random_cost_standard_error"]) == (1.0, 1.0)
+    assert [row["episode_cost_standard_error"] for row in content["per_seed"]] == [1.0, 2.0]
+    assert content["aggregate"]["episode_cost"]["low"] is None
 
 
 def test_poses_are_drawn_from_the_engine() -> None:
@@ -182,7 +364,7 @@ def test_poses_are_drawn_from_the_engine() -> None:
     np.testing.assert_allclose(lengths[0, 0], 1.0, atol=1e-6)  # the torso's capsule, 2 x 0.5 m
     assert -0.2 < poses.frames[:, :, [1, 3]].min() < 0.3  # it lies on the floor
     text = to_html(poses, "episode", "a <cheetah>.")
-    assert "a &lt;cheetah&gt;." in text
+    assert "a &lt;cheetah&gt;. Its first 20 steps are played;" in text
     assert text.count("<canvas") == 1
 
 

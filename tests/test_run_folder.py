@@ -3,7 +3,10 @@
 import csv
 import errno
 import json
+import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,3 +89,61 @@ def test_a_full_disk_is_told_with_its_folder(tmp_path: Path, monkeypatch: pytest
         with pytest.raises(OSError, match="No space left") as caught:
             writer.write(1, {"env_steps": np.full((1, 2), 64), "kl": np.zeros((1, 2))})
     assert caught.value.filename == str(tmp_path)
+
+
+def events(folder: Path) -> Iterator[tuple[int, dict[str, float]]]:
+    """Step and values of every event that has some."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    (file,) = folder.glob("events*")
+    data, at = file.read_bytes(), 0
+    while at < len(data):  # length, its checksum, the event, its checksum
+        (length,) = struct.unpack_from("<Q", data, at)
+        event: Any = Event.FromString(data[at + 12 : at + 12 + length])
+        at += 16 + length
+        if event.summary.value:
+            yield event.step, {value.tag: value.simple_value for value in event.summary.value}
+
+
+def test_nothing_is_said_of_episodes_before_one_has_ended(tmp_path: Path) -> None:
+    """Two seeds: none has an episode after the first iteration, one after the second, both after the third."""
+    nan = np.nan
+    rows = metrics(3) | {"episode_cost": np.array([[nan, nan], [nan, 4.0], [2.0, 6.0]])}
+    with run_folder.MetricsWriter(tmp_path) as writer:
+        writer.begin({})
+        writer.write(3, rows)
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        assert [row["episode_cost"] for row in csv.DictReader(file)] == ["", "", "", "4", "2", "6"]
+    np.testing.assert_array_equal(run_folder.read_metrics(tmp_path)["episode_cost"], rows["episode_cost"])
+    said = [values for _, values in events(tmp_path)]
+    costs = [{tag: value for tag, value in values.items() if tag.endswith("/episode_cost")} for values in said]
+    assert costs == [
+        {},
+        {"mean/episode_cost": 4.0, "seed_1/episode_cost": 4.0},
+        {"mean/episode_cost": 4.0, "seed_0/episode_cost": 2.0, "seed_1/episode_cost": 6.0},
+    ]
+    assert all({"mean/episode_return", "seed_0/episode_return", "seed_1/episode_return"} <= set(v) for v in said)
+
+
+def test_folders_of_earlier_versions_are_read_without_their_placeholders(tmp_path: Path) -> None:
+    rows = metrics(3) | {"episode_cost": np.array([[25.0, 25.0], [25.0, 4.0], [2.0, 6.0]])}
+    rows |= {"episodes_finished": np.array([[0, 0], [0, 1], [1, 0]]), "kl": np.full((3, 2), 0.5)}
+    with run_folder.MetricsWriter(tmp_path) as writer:
+        writer.begin(rows)
+    read, nan = run_folder.read_metrics(tmp_path), np.nan
+    np.testing.assert_array_equal(read["episode_cost"], [[nan, nan], [nan, 4.0], [2.0, 6.0]])
+    np.testing.assert_array_equal(read["episode_return"], [[nan, nan], [nan, 2.5], [3.0, 3.5]])
+    np.testing.assert_array_equal(read["kl"], rows["kl"])
+
+
+def test_events_advance_where_no_environment_steps_are_taken(tmp_path: Path) -> None:
+    """Behaviour cloning: its axis is the number of passes, chunk after chunk. Others keep environment steps."""
+    cloning, steps = tmp_path / "cloning", tmp_path / "steps"
+    for folder, rows in ((cloning, {"env_steps": np.zeros((2, 1))}), (steps, {"env_steps": np.full((2, 1), 50)})):
+        folder.mkdir()
+        with run_folder.MetricsWriter(folder) as writer:
+            writer.begin({})
+            for iteration in (2, 4):
+                writer.write(iteration, rows | {"loss": np.ones((2, 1))})
+    assert [step for step, _ in events(cloning)] == [1, 2, 3, 4]
+    assert [step for step, _ in events(steps)] == [50] * 4
