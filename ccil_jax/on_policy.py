@@ -171,7 +171,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
         cost_rate = running_mean(state.cost_rate, jnp.mean(generator_metrics.pop("mean_cost")), iteration)
         metrics = {
             **episode_metrics(state.estimates, cost_rate),
-            "multiplier": constraint.multiplier(constraint_state),
+            **({"multiplier": constraint.multiplier(constraint_state)} if config.has_multiplier else {}),
             "entropy": distributions.entropy(
                 Gaussian(mean=jnp.zeros(()), log_std=state.actor.policy_params["log_std"])
             ),

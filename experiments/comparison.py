@@ -10,7 +10,7 @@ import numpy as np
 from ccil_jax.config import Config
 from experiments import run_folder
 from experiments.statistics import bootstrap_interval
-from experiments.summary import BEYOND_ERROR, NO_INTERVAL, bounds, has_multiplier, marked, number, show
+from experiments.summary import BEYOND_ERROR, NO_INTERVAL, bounds, marked, number, show
 from experiments.variants import Variant
 
 SCORES = ("episode_return", "episode_cost", "recovered_return", "relative_cost_violation")
@@ -46,7 +46,7 @@ def multiplier_path(config: Config, metrics: Mapping[str, np.ndarray], limit: fl
     known cost in which the cost was already below the limit while the multiplier was still above its final value.
     Methods without a multiplier get None, whatever they log.
     """
-    if not has_multiplier(config):
+    if not config.has_multiplier:
         return dict.fromkeys(("max_multiplier", "final_multiplier", "windup"))
     multiplier, episode_cost = metrics["multiplier"], metrics["episode_cost"]
     last = max(1, round(_FINAL * len(multiplier)))

@@ -1,12 +1,11 @@
 """Evaluates every seed of a trained run: return and cost over fresh episodes, in our simulator or the original one."""
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ccil_jax.versions import versions
 from envs.registry import TASKS
@@ -100,20 +99,16 @@ def evaluate_run(stored: Run, arguments: argparse.Namespace) -> tuple[dict[str, 
             exporting.export_stablehlo(file, loaded.config, loaded.agent, env)
         print(f"policies {file}")
     random = evaluation.random_policy(env, num_episodes=arguments.episodes, seed=arguments.seed)
-    reference = summary.Reference(
-        expert_return=stored.facts["expert_return"],
-        expert_cost=stored.facts["expert_cost"],
-        random_return=float(np.mean(random.episode_return)),
-        random_cost=float(np.mean(random.episode_cost)),
-        cost_limit=stored.config.cost_limit,
-    )
+    reference = summary.make_reference(stored.facts, random, stored.config.prescribed_limit)
     rows = summary.per_seed_scores(evaluated, None, reference)
     return {
         **settings,
         "command": command_line.command(),
         "versions": versions(),
+        **dataclasses.asdict(reference),
         "per_seed": rows,
         "aggregate": summary.aggregate_scores(rows),
+        "violation_beyond_error": summary.mean_violation_beyond_error(rows, reference),
     }, reference
 
 

@@ -12,14 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ccil_jax.demonstrations import Demonstrations, save_demonstrations
 from ccil_jax.versions import versions
 from experiments import command_line, options, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.resuming import resumed
-from experiments.summary import number, show
+from experiments.summary import number, show, with_error
 from experiments.training import Outcome, Plan, execute
 
 PRESETS = {"locomotion": "expert", "safety_gym": "safety_gym_expert"}  # of each family
@@ -154,9 +152,9 @@ def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
     for i, (cost, length) in enumerate(zip(costs, lengths, strict=True)):
         table.add_row(f"trajectory {i}", number(None if returns is None else returns[i]), number(cost), str(length))
     table.add_section()
-    mean_return = None if returns is None else float(np.mean(returns))
-    length = number(demonstrations.mean_episode_length)
-    table.add_row("mean", number(mean_return), number(demonstrations.mean_episode_cost), length)
+    mean_return = with_error(demonstrations.mean_episode_return, demonstrations.return_standard_error)
+    mean_cost = with_error(demonstrations.mean_episode_cost, demonstrations.cost_standard_error)
+    table.add_row("mean +- standard error", mean_return, mean_cost, number(demonstrations.mean_episode_length))
     random = demonstrations.metadata["random_policy"]
     table.add_row("random policy", number(random["return"]), number(random["cost"]), "")
     if demonstrations.metadata["cost_limit"] is not None:
@@ -169,7 +167,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Trains, chooses, records; status 1 where no seed keeps the limit."""
     plan = make_plan(arguments)
     outcome = execute(plan)
-    seed = choose_seed(outcome.summary["per_seed"], plan.config.cost_limit)
+    seed = choose_seed(outcome.summary["per_seed"], plan.config.prescribed_limit)
     if seed is None:
         lowest = min(row["episode_cost"] for row in outcome.summary["per_seed"])
         print(

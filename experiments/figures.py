@@ -81,7 +81,7 @@ def read_curve(folder: Path, label: str | None = None) -> Curve:
             "episode_cost": cost,
             "cost_rate": cost / length if length else None,
         },
-        cost_limit=run.config.cost_limit,
+        cost_limit=run.config.prescribed_limit,
         expert_errors={
             name: run.facts.get(f"{level}_standard_error")  # earlier versions do not say
             for name, level in (("episode_return", "expert_return"), ("episode_cost", "expert_cost"))

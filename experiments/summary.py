@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations, standard_error
 from experiments.statistics import MIN_SEEDS, bootstrap_interval
 
@@ -86,11 +85,6 @@ def make_reference(levels: Mapping[str, Any], random: Any, cost_limit: float | N
         random_cost_standard_error=standard_error(random.episode_cost[0]),
         cost_limit=cost_limit,
     )
-
-
-def has_multiplier(config: Config) -> bool:
-    """Whether the method learns a multiplier; the others have none to show."""
-    return config.method in ("malm", "ccil", "lgail", "expert", "pid_il") and config.multiplier_update != "optimal"
 
 
 def scores(episode_return: float, episode_cost: float, reference: Reference) -> dict[str, float | bool | None]:

@@ -102,7 +102,7 @@ def execute_together(
             title,
             first.config.num_iterations,
             first.cost_limit,
-            has_multiplier=summary.has_multiplier(first.config),
+            has_multiplier=first.config.has_multiplier,
         ) as display,
         Interruption() as interruption,
     ):
@@ -268,7 +268,7 @@ def _finish(
     """
     from experiments import figures  # imports matplotlib: no argument error should wait for it
 
-    reference = summary.make_reference(summary.expert_levels(plan.demonstrations), random, plan.config.cost_limit)
+    reference = summary.make_reference(summary.expert_levels(plan.demonstrations), random, plan.config.prescribed_limit)
     metrics = run_folder.read_metrics(plan.folder)
     rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
