@@ -1,5 +1,6 @@
 """Sweeps: what is wrong with a spec, how it becomes programs, and one tiny sweep whose worker is killed."""
 
+import hashlib
 import json
 import os
 import signal
@@ -8,10 +9,16 @@ import time
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
+import envs
+from ccil_jax import digests, runner
+from ccil_jax.demonstrations import Demonstrations, save_demonstrations
 from experiments import run_folder, sweep, variants, workers
+from experiments.command_line import UsageError
+from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config
 from tests.processes import command_lines, in_proc
 
 FIXED = {"preset": "tiny", "num_seeds": 2, "max_episode_steps": 20, "eval_episodes": 3, "cost_limit": 5.0}
@@ -42,6 +49,8 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "wrong integer": ({"grid": {"num_envs": [1.5]}}, "--num-envs: invalid integer value"),
     "out of range": ({"grid": {"max_kl": [0.01, 0]}}, "--max-kl 0"),
     "not a table": ({"grid": [1]}, "grid: give a table of fields"),
+    "same run twice": ({"grid": {"gamma": [0.9, "0.90"]}}, "gamma=0.90 is the same run as gamma=0.9; leave one"),
+    "no effect": ({"grid": {"gate": ["batch", "episode"]}}, "--gate batch: makes no difference to this run of method"),
     "limit missing": ({"fixed": {"preset": "tiny"}}, "--cost-limit: method expert needs"),
 }
 
@@ -58,6 +67,37 @@ def test_a_wrong_spec_is_one_line(case: str, tmp_path: Path, capsys: pytest.Capt
     assert f"SPEC {path}: " in error
     assert message in error
     assert not (tmp_path / "out").exists()
+
+
+def test_points_that_would_share_a_folder_are_refused(tmp_path: Path) -> None:
+    files = [tmp_path / "a" / "b.npz", tmp_path / "a_b.npz"]
+    for seed, file in enumerate(files):
+        save_demonstrations(file, swimmer_demonstrations(seed))
+    grid = {"demos": [str(file) for file in files]}
+    spec = {"env": "Swimmer", "method": "gail", "fixed": {"preset": "tiny"}, "grid": grid}
+    with pytest.raises(UsageError, match="grid: two points would share the folder demos=.*a_b.npz; rename"):
+        sweep.variants_of(tmp_path / "s.json", spec, tmp_path)
+
+
+def swimmer_demonstrations(seed: int) -> Demonstrations:
+    random, last = np.random.default_rng(seed), np.arange(20) == 19
+    return Demonstrations(
+        obs=random.normal(size=(20, 8)).astype(np.float32),
+        actions=random.uniform(-1, 1, (20, 2)).astype(np.float32),
+        rewards=None,
+        costs=np.ones(20, np.float32),
+        terminated=np.zeros(20, bool),
+        truncated=last,
+        episode_ends=np.array([20]),
+    )
+
+
+def test_variants_share_what_they_read(tmp_path: Path) -> None:
+    spec = {"env": "Swimmer", "method": "ccil", "fixed": {"preset": "tiny"}, "grid": {"gamma": [0.9, 0.99]}}
+    found = sweep.variants_of(tmp_path / "s.json", spec, tmp_path)
+    one, other = (variant.plan.demonstrations for variant, _ in found.values())
+    assert one is not None
+    assert one is other
 
 
 @pytest.mark.parametrize(
@@ -151,19 +191,115 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
     np.testing.assert_array_equal(slow["episode_return"][0], fast["episode_return"][0])
     assert (slow["multiplier"][-1] != fast["multiplier"][-1]).all()
 
-    # Interrupted: what is finished stays as it is, what is not is finished.
-    missing = out / "runs" / "multiplier_learning_rate=0.5,hidden_sizes=4" / "summary.json"
-    missing.unlink()
-    others = {path: path.stat().st_mtime_ns for path in out.glob("runs/*/summary.json")}
+    checkpoints_agree_with_metrics(out)
+
+    # Interrupted: what is finished stays as it is, what is not is finished, from the checkpoints of its program.
+    folder = out / "runs" / "multiplier_learning_rate=0.5,hidden_sizes=4"
+    before = run_folder.read_metrics(folder)
+    (folder / "summary.json").unlink()
+    others = {
+        path: path.stat().st_mtime_ns
+        for path in out.glob("runs/*/**/*")
+        if path.is_file() and folder not in path.parents
+    }
     assert sweep.main([str(spec), "--out", str(out), "--resume"]) == 0
     assert "in 2 programs, 1 of them unfinished" in capsys.readouterr().out
-    assert missing.exists()
+    assert (folder / "summary.json").exists()
     assert {path: path.stat().st_mtime_ns for path in others} == others
+    assert sorted(path.name for path in (folder / "checkpoints").glob("[0-9]*")) == ["2"]
+    after = run_folder.read_metrics(folder)
+    assert all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
+    checkpoints_agree_with_metrics(out)
 
     for changes, message in (({"method": "trpo"}, "--resume: method is 'trpo'"), ({"fixed": FIXED | {"seed": 1}}, "")):
         with pytest.raises(SystemExit):
             sweep.main([str(write_spec(tmp_path, "other.json", **changes)), "--out", str(out), "--resume"])
         assert message in capsys.readouterr().err
+
+
+def checkpoints_agree_with_metrics(out: Path) -> None:
+    """Every variant's own checkpoint can be loaded, and holds the run that its metrics tell of."""
+    for folder in out.glob("runs/*"):
+        run = run_folder.read_run(folder)
+        env = envs.make("Swimmer", **run.facts["env_options"])
+        assert jax.tree.leaves(runner.load(run.config, env, folder / "checkpoints", 2).agent)
+        saved = digests.read(folder / "checkpoints" / "2")["arrays"]
+        metrics = run_folder.read_metrics(folder)
+        assert {name for name in saved if name.startswith("history.")} == {f"history.{name}" for name in metrics}
+        for name, rows in metrics.items():  # nine digits are enough for a float32 number
+            fact = saved[f"history.{name}"]
+            assert hashlib.sha256(rows.astype(fact["dtype"]).tobytes()).hexdigest() == fact["sha256"], name
+
+
+def test_a_run_that_another_program_left_is_set_aside_whole(tmp_path: Path) -> None:
+    """As where a version before this one grouped what was unfinished anew, and trained it to the same step."""
+    with quick_compilation():
+        old, new = (
+            runner.train(walk_config(method="trpo", gamma=gamma, env_steps=64), Walk()) for gamma in (0.9, 0.99)
+        )
+    runner.save(old, tmp_path)
+    runner.save(old, tmp_path)  # the same run: nothing to do
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1"]
+    runner.save(new, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "1.replaced"]
+    assert same_bits(runner.load(new.config, Walk(), tmp_path, 1).agent, new.agent)
+
+
+def test_a_stopped_sweep_starts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stopping = threading.Event()
+    stopping.set()
+    assert workers.run_worker(tmp_path, stopping=stopping) == "stopped before it began"
+    assert list(tmp_path.iterdir()) == []
+
+    begun = []
+
+    def work(folder: Path, cpus: Any, stopping: threading.Event, variables: Any) -> str | None:
+        begun.append(folder.name)
+        if folder.name != "a":
+            assert stopping.wait(60)
+        return None
+
+    monkeypatch.setattr(workers, "run_worker", work)
+    outcomes = workers.in_processes([Path(name) for name in "abc"], num_workers=1)
+    assert next(outcomes) == (Path("a"), None)
+    while begun != ["a", "b"]:
+        time.sleep(0.01)
+    outcomes.close()
+    assert begun == ["a", "b"]
+
+
+def test_workers_share_the_gpus_of_a_machine() -> None:
+    fraction = "XLA_PYTHON_CLIENT_MEM_FRACTION"
+    assert workers.gpu_share(0, 4, [], {}) == {}
+    assert workers.gpu_share(0, 1, ["0", "1"], {}) == {}  # a worker alone has them all
+    assert [workers.gpu_share(i, 2, ["0", "7"], {}) for i in range(2)] == [
+        {"CUDA_VISIBLE_DEVICES": "0"},
+        {"CUDA_VISIBLE_DEVICES": "7"},
+    ]
+    assert [workers.gpu_share(i, 3, ["0", "1"], {}) for i in range(3)] == [
+        {"CUDA_VISIBLE_DEVICES": gpu, fraction: "0.400"} for gpu in ("0", "1", "0")
+    ]
+    own = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    assert workers.gpu_share(1, 3, ["0"], own) == {"CUDA_VISIBLE_DEVICES": "0"}
+
+
+def test_gpus_are_those_that_the_user_lets_a_process_see(tmp_path: Path) -> None:
+    assert workers.visible_gpus({}, driver=tmp_path / "none") == []
+    for name in ("0000:01:00.0", "0000:02:00.0"):
+        (tmp_path / name).mkdir()
+    assert workers.visible_gpus({}, driver=tmp_path) == ["0", "1"]
+    assert workers.visible_gpus({"CUDA_VISIBLE_DEVICES": "3,GPU-5"}, driver=tmp_path) == ["3", "GPU-5"]
+    assert workers.visible_gpus({"CUDA_VISIBLE_DEVICES": ""}, driver=tmp_path) == []
+
+
+def test_settings_of_slurm_are_refused_where_slurm_is_not_used(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        sweep.main([str(write_spec(tmp_path)), "--out", str(tmp_path / "out"), "--slurm", "timeout_min=5"])
+    assert end.value.code == 2
+    assert "--slurm: --launcher processes does not use it; leave it out" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def broken_program(folder: Path) -> Path:
