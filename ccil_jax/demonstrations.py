@@ -189,9 +189,9 @@ def check_time_limit(demonstrations: Demonstrations, source: str | os.PathLike[s
     if lengths[longest] > max_episode_steps:
         raise DemonstrationsError(
             f"{source}: trajectory {longest} has {lengths[longest]} steps, an episode of this run has at most "
-            f"{max_episode_steps}; the cost limit is the mean cost of a demonstrated episode, so in shorter episodes the "
-            f"constraint would never bind; use --max-episode-steps {lengths[longest]} (in Python: max_episode_steps) or "
-            "other demonstrations"
+            f"{max_episode_steps}; the cost limit is the mean cost of a demonstrated episode, so in shorter episodes "
+            f"the constraint would never bind; use --max-episode-steps {lengths[longest]} (in Python: "
+            "max_episode_steps) or other demonstrations"
         )
 
 

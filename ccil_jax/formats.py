@@ -180,6 +180,8 @@ def _episode(found: Mapping[str, np.ndarray], name: str, path: Path) -> Arrays:
             raise ArchiveError(f"{where(key)} is missing; only plain arrays of steps can be used")
     actions = columns.rows(found[f"{name}/actions"], where("actions"))
     length = len(actions)
+    if length == 0:
+        raise ArchiveError(f"{where('actions')} has no rows: an episode without steps; remove that episode")
     rewards = found.get(f"{name}/rewards")
     return {
         "obs": columns.rows(found[f"{name}/observations"], where("observations"), length + 1)[:-1],

@@ -25,7 +25,7 @@ def read(path: Path) -> dict[str, np.ndarray]:
     """
     if importlib.util.find_spec("h5py") is None:
         raise npz.ArchiveError(f"{path}: reading HDF5 needs h5py; install it with `pip install 'ccil_jax[hdf5]'`")
-    file, place = _nameless_file(path)
+    file, place, remedy = _nameless_file(path)
     with file:
         try:
             status, complaint = run_child([str(path.absolute()), str(file.fileno()), str(npz.MAX_BYTES)])
@@ -34,27 +34,27 @@ def read(path: Path) -> dict[str, np.ndarray]:
         if status == hdf5_child.REFUSED:
             raise npz.ArchiveError(f"{path}: {complaint}")
         if status == hdf5_child.NOT_WRITTEN:
-            raise npz.ArchiveError(f"{path}: its arrays could not be put into {place} ({complaint})")
+            raise npz.ArchiveError(f"{path}: its arrays could not be put into {place} ({complaint}); {remedy}")
         if status != 0:
             raise npz.ArchiveError(f"{path}: damaged HDF5 file, its reader ended with status {status}; copy it again")
         return npz.read_open(file, str(path), sorted(npz.keys_of(file)), remedy="copy the file again")
 
 
-def _nameless_file(path: Path) -> tuple[BinaryIO, str]:
-    """A file for the child's arrays that is gone when closed, and where it is, with a remedy should that be full.
+def _nameless_file(path: Path) -> tuple[BinaryIO, str, str]:
+    """A file for the child's arrays, gone once it is closed; where it is; and what to do if there is no room.
 
     It is in memory where the system has such files, so that no temporary folder is needed.
     """
     with contextlib.suppress(AttributeError, OSError):
-        descriptor = os.memfd_create("arrays")
-        return os.fdopen(descriptor, "w+b"), "memory; free some, raise the limits of `ulimit`, or use fewer episodes"
+        file = os.fdopen(os.memfd_create("arrays"), "w+b")
+        return file, "memory", "free some, raise the limits that `ulimit -a` shows, or use fewer episodes"
     try:
-        place = f"the temporary folder {tempfile.gettempdir()}; make space there or set TMPDIR to another folder"
-        return tempfile.TemporaryFile(), place
+        file = tempfile.TemporaryFile()  # noqa: SIM115  (closed by the caller)
     except OSError as error:
         raise npz.ArchiveError(
             f"{path}: reading HDF5 needs a temporary folder that can be written ({error.strerror}); set TMPDIR to one"
         ) from None
+    return file, f"the temporary folder {tempfile.gettempdir()}", "make space there or set TMPDIR to another folder"
 
 
 def run_child(arguments: Sequence[str]) -> tuple[int, str]:

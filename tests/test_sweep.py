@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from experiments import run_folder, sweep, variants, workers
+from experiments.command_line import UsageError
 from tests.processes import command_lines, in_proc
 
 FIXED = {"preset": "tiny", "num_seeds": 2, "max_episode_steps": 20, "eval_episodes": 3, "cost_limit": 5.0}
@@ -67,6 +68,7 @@ def test_a_wrong_spec_is_one_line(case: str, tmp_path: Path, capsys: pytest.Capt
         ("s.toml", "a = = 1", "not TOML (Invalid value (at line 1"),
         ("s.json", "{", "not JSON (Expecting property name"),
         ("s.json", "[]", "give a table with env, method"),
+        ("s.json", "[" * 100_000, "nested too deeply"),
     ],
 )
 def test_a_damaged_spec_is_one_line(
@@ -83,6 +85,19 @@ def test_toml_and_json_are_the_same(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text('env = "Swimmer"\nmethod = "expert"\n[grid]\ngamma = [0.9, 1]\n')
     (tmp_path / "s.json").write_text('{"env": "Swimmer", "method": "expert", "grid": {"gamma": [0.9, 1]}}')
     assert sweep.read_spec(tmp_path / "s.toml") == sweep.read_spec(tmp_path / "s.json")
+
+
+def test_a_byte_order_mark_does_not_matter_and_other_encodings_are_named(tmp_path: Path) -> None:
+    texts = {
+        "s.toml": 'env = "Swimmer"\n[grid]\ngamma = [0.9, 1]\n',
+        "s.json": '{"env": "Swimmer", "grid": {"gamma": [0.9, 1]}}',
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+        assert sweep.read_spec(tmp_path / name) == {"env": "Swimmer", "fixed": {}, "grid": {"gamma": [0.9, 1]}}
+        (tmp_path / name).write_text(text, encoding="utf-16")
+        with pytest.raises(UsageError, match=rf"SPEC .*{name}: not text in UTF-8; save it with that encoding"):
+            sweep.read_spec(tmp_path / name)
 
 
 def test_static_fields_make_programs_and_traced_fields_share_them(tmp_path: Path) -> None:
