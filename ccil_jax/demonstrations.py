@@ -9,16 +9,25 @@ Other formats are read too: `ccil_jax.formats`. Files come from strangers, so no
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from ccil_jax import formats, npz
+from ccil_jax import columns, formats, npz
 
-_RANKS = {"obs": 2, "actions": 2, "rewards": 1, "costs": 1, "terminated": 1, "truncated": 1, "episode_ends": 1}
-_STEP_KEYS = ("obs", "actions", "rewards", "costs", "terminated", "truncated")
+_FORMS: Mapping[str, Callable[[np.ndarray, str], np.ndarray]] = {
+    "obs": columns.rows,
+    "actions": columns.rows,
+    "rewards": columns.per_step,
+    "costs": columns.per_step,
+    "terminated": columns.flags,
+    "truncated": columns.flags,
+    "episode_ends": columns.indices,
+}
+_NUMBER_KEYS = ("obs", "actions", "rewards", "costs")
+_STEP_KEYS = (*_NUMBER_KEYS, "terminated", "truncated")
 _REWRITE = "write the file with ccil_jax.save_demonstrations"
 
 
@@ -148,7 +157,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, default_cost: float | N
 
 def _read_own(path: Path) -> dict[str, Any]:
     arrays: dict[str, Any] = {"rewards": None}
-    arrays.update(npz.read(path, (*_RANKS, "metadata"), optional=frozenset({"rewards"}), remedy=_REWRITE))
+    arrays.update(npz.read(path, (*_FORMS, "metadata"), optional=frozenset({"rewards"}), remedy=_REWRITE))
     arrays["metadata"] = _parse_metadata(arrays["metadata"], path)
     return arrays
 
@@ -162,7 +171,7 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrat
     if path.suffix != ".npz":
         raise DemonstrationsError(f"{path}: a demonstrations file is named *.npz")
     checked = _checked({f.name: getattr(demonstrations, f.name) for f in dataclasses.fields(Demonstrations)}, str(path))
-    arrays = {key: value for key in _RANKS if (value := getattr(checked, key)) is not None}
+    arrays = {key: value for key in _FORMS if (value := getattr(checked, key)) is not None}
     try:
         text = json.dumps(checked.metadata, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -185,12 +194,29 @@ def check_matches(demonstrations: Demonstrations, path: str | os.PathLike[str], 
             )
 
 
+def check_time_limit(demonstrations: Demonstrations, source: str | os.PathLike[str], max_episode_steps: int) -> None:
+    """Raises `DemonstrationsError`, which begins with `source`, if a trajectory is longer than the learner's episodes.
+
+    The learner's cost limit is the mean cost of a demonstrated episode. An episode of the learner that is cut off
+    earlier has fewer steps in which to cost anything, so the constraint would never bind, and nothing would show that.
+    """
+    lengths = demonstrations.episode_lengths
+    longest = int(np.argmax(lengths))
+    if lengths[longest] > max_episode_steps:
+        raise DemonstrationsError(
+            f"{source}: trajectory {longest} has {lengths[longest]} steps, an episode of this run has at most "
+            f"{max_episode_steps}; the cost limit is the mean cost of a demonstrated episode, so in shorter episodes "
+            f"the constraint would never bind; use --max-episode-steps {lengths[longest]} (in Python: "
+            "max_episode_steps) or other demonstrations"
+        )
+
+
 def _parse_metadata(array: np.ndarray, path: Path) -> dict[str, Any]:
     try:
         if array.nbytes > formats.MAX_METADATA_BYTES or (array.dtype != np.uint8 and array.ndim):
             raise ValueError("not a text of reasonable length")
         text = array.tobytes().decode() if array.dtype == np.uint8 else str(array.astype(np.str_)[()])
-        metadata = json.loads(text)
+        metadata = json.loads(text.removeprefix("\ufeff"))  # some editors begin a text with a byte order mark
     except (ValueError, RecursionError):
         metadata = None
     if not isinstance(metadata, dict):
@@ -200,7 +226,8 @@ def _parse_metadata(array: np.ndarray, path: Path) -> dict[str, Any]:
 
 def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
     """The arrays, in their final types, as sound `Demonstrations`; `source` begins every complaint."""
-    converted: dict[str, Any] = {key: _convert(arrays[key], key, source) for key in _RANKS if arrays[key] is not None}
+    known = [key for key in _FORMS if key != "rewards" or arrays[key] is not None]
+    converted: dict[str, Any] = {key: _convert(arrays[key], key, source) for key in known}
     num_steps = len(converted["obs"])
     if num_steps == 0:
         raise DemonstrationsError(f"{source}: 'obs' is empty; record at least one episode")
@@ -216,25 +243,15 @@ def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
 
 
 def _convert(value: Any, key: str, source: str) -> np.ndarray:
-    """`value` as the type that `key` has, of the right rank."""
-    array = np.asarray(value)
-    wanted, kinds = ("bool", "b") if key in ("terminated", "truncated") else ("number", "fiu")
-    if key == "episode_ends":
-        wanted, kinds = "integer", "iu"
-    if array.dtype.kind not in kinds:
-        raise DemonstrationsError(
-            f"{source}: '{key}' has dtype {array.dtype}, must be {wanted}; convert it and save again"
-        )
-    if array.ndim != _RANKS[key]:
-        raise DemonstrationsError(
-            f"{source}: '{key}' has shape {array.shape}, must have {_RANKS[key]} axes; reshape it"
-        )
-    if array.ndim == 2 and array.shape[1] == 0:
-        raise DemonstrationsError(f"{source}: '{key}' has no columns; record it again")
-    if wanted == "number":
-        with np.errstate(over="ignore", invalid="ignore"):  # what does not fit float32 is reported as not finite
-            return array.astype(np.float32)
-    return array.astype(np.int64 if wanted == "integer" else np.bool_)
+    """`value` in the form and the type that `key` has."""
+    try:
+        array = _FORMS[key](np.asarray(value), f"{source}: '{key}'")
+    except npz.ArchiveError as error:
+        raise DemonstrationsError(str(error)) from None
+    if key not in _NUMBER_KEYS:
+        return array
+    with np.errstate(over="ignore", invalid="ignore"):  # what does not fit float32 is reported as not finite
+        return array.astype(np.float32)
 
 
 def _check_episode_ends(ends: np.ndarray, num_steps: int, source: str) -> None:
@@ -257,7 +274,7 @@ def _check_values(checked: Demonstrations, source: str) -> None:
         trajectory = int(np.searchsorted(checked.episode_ends, row, side="right"))
         raise DemonstrationsError(f"{source}: '{key}' {complaint} (trajectory {trajectory}, row {row})")
 
-    for key in ("obs", "actions", "rewards", "costs"):
+    for key in _NUMBER_KEYS:
         value = getattr(checked, key)
         if value is not None:
             finite = np.isfinite(value).reshape(len(value), -1).all(axis=1)

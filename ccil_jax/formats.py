@@ -9,6 +9,7 @@
 Nothing read here is trusted: `npz`, `legacy_npz` and `hdf5` bound what is read, and the caller checks every value.
 """
 
+import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -16,11 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from ccil_jax import hdf5, legacy_npz, npz
+from ccil_jax import columns, hdf5, hdf5_child, legacy_npz, npz
 from ccil_jax.npz import ArchiveError
 
 MAX_METADATA_BYTES = 1024**2
-NO_COSTS = "holds no cost of each step; constrained methods need it (`convert --default-cost 0` for gail)"
+NO_COSTS = (
+    "holds no cost of each step ('costs' in DSRL, 'infos/cost' in Minari, 'accucost' or 'costs' in baselines and CCIL "
+    "files); constrained methods need it (`convert --default-cost 0` for gail)"
+)
 _MINARI_DATA = Path("data") / "main_data.hdf5"
 
 Arrays = dict[str, Any]
@@ -42,7 +46,8 @@ def reader_of(path: Path) -> Callable[[Path], Arrays] | None:
         return None  # the reader of our own format says why
     if start == hdf5.SIGNATURE:
         return _read_hdf5
-    return _read_legacy if start[:2] == b"PK" and "acs" in npz.keys_of(path) else None
+    keys = npz.keys_of(path) if start[:2] == b"PK" else frozenset()
+    return _read_legacy if "acs" in keys and "episode_ends" not in keys else None  # the latter is ours alone
 
 
 def _read_legacy(path: Path) -> Arrays:
@@ -52,15 +57,12 @@ def _read_legacy(path: Path) -> Arrays:
             raise ArchiveError(
                 f"{path}: '{key}' has {len(parts)} trajectories, 'obs' has {len(found['obs'])}; they must be equal"
             )
-    for key in legacy_npz.KEYS:
-        for i, part in enumerate(found[key]):
-            if part.ndim == 0:
-                raise ArchiveError(f"{path}: '{key}' has shape () (trajectory {i}), must have one row a step")
-    lengths = [len(part) for part in found["obs"]]
-    rewards = _columns(found["rews"], lengths, "rews", path) if "rews" in found else None
+    obs, actions = ([_flat(part, _of(path, key, i)) for i, part in enumerate(found[key])] for key in legacy_npz.KEYS)
+    lengths = [len(part) for part in obs]
+    rewards = _per_trajectory(found, "rews", lengths, path)
     return {
-        "obs": _join([_rows(part) for part in found["obs"]], "obs", path),
-        "actions": _join([_rows(part) for part in found["acs"]], "acs", path),
+        "obs": _join(obs, "obs", path),
+        "actions": _join(actions, "acs", path),
         "rewards": None if rewards is None else _join(rewards, "rews", path),
         "costs": _legacy_costs(found, lengths, path),
         **_flags_at_ends(lengths),
@@ -70,44 +72,52 @@ def _read_legacy(path: Path) -> Arrays:
 
 def _legacy_costs(found: Mapping[str, Sequence[np.ndarray]], lengths: Sequence[int], path: Path) -> np.ndarray | None:
     """`accucost` is the running sum of an episode's costs; `costs` may be of each step or each episode's total."""
-    if "accucost" in found:
-        parts = []
-        for i, sums in enumerate(_columns(found["accucost"], lengths, "accucost", path)):
-            cost = np.diff(sums.astype(np.float64), prepend=0.0)
-            if (cost < 0).any():
-                raise ArchiveError(
-                    f"{path}: 'accucost' decreases (trajectory {i}, row {int(np.argmax(cost < 0))}); "
-                    "it must be the running sum of costs"
-                )
-            parts.append(cost)
-        return _join(parts, "accucost", path)
-    if "costs" not in found or all(part.ndim == 0 for part in found["costs"]):
-        return None
-    return _join(_columns(found["costs"], lengths, "costs", path), "costs", path)
+    given = found.get("costs", ())
+    totals = all(part.ndim == 0 for part in given) or (
+        all(part.size == 1 for part in given) and any(length != 1 for length in lengths)
+    )
+    costs = None if totals else _per_trajectory(found, "costs", lengths, path)
+    sums = _per_trajectory(found, "accucost", lengths, path)
+    if sums is None:
+        return None if costs is None else _join(costs, "costs", path)
+    with np.errstate(invalid="ignore"):  # NaN and infinity are complained of later
+        steps = [np.diff(part.astype(np.float64), prepend=0.0) for part in sums]
+    for i, step in enumerate(steps):
+        if (step < 0).any():
+            raise ArchiveError(
+                f"{_of(path, 'accucost', i)} decreases (row {int(np.argmax(step < 0))}); it must be the running sum of "
+                "costs"
+            )
+        if costs is not None and not np.allclose(np.cumsum(costs[i], dtype=np.float64), sums[i], rtol=1e-3):
+            raise ArchiveError(_contradiction(_of(path, "accucost", i), "costs"))
+    return _join(steps, "accucost", path)
 
 
 def _read_hdf5(path: Path) -> Arrays:
     found = hdf5.read(path)
-    if any(name.startswith("episode_") for name in found):
-        return _minari(found, path)
+    return _minari(found, path) if any(name.startswith("episode_") for name in found) else _dsrl(found, path)
+
+
+def _dsrl(found: Mapping[str, np.ndarray], path: Path) -> Arrays:
     for key in ("observations", "actions", "terminals", "timeouts"):
         if key not in found:
             raise ArchiveError(f"{path}: key '{key}' is missing; DSRL and Minari files can be read")
-    if found["observations"].ndim == 0:
-        raise ArchiveError(f"{path}: 'observations' has shape (), must have one row a step")
-    num_rows = len(found["observations"])
-    for key, array in found.items():
-        if array.ndim == 0 or len(array) != num_rows:
-            raise ArchiveError(f"{path}: '{key}' has shape {array.shape}, must have {num_rows} rows as 'observations'")
-    terminated, truncated = (_flags(found[key], key, path) for key in ("terminals", "timeouts"))
+    obs = columns.rows(found["observations"], f"{path}: 'observations'")
+    terminated, truncated = (
+        columns.flags(found[key], f"{path}: '{key}'", (len(obs),)) for key in ("terminals", "timeouts")
+    )
     ends = np.flatnonzero(terminated | truncated) + 1
     if len(ends) == 0:
         raise ArchiveError(f"{path}: neither 'terminals' nor 'timeouts' is ever true: no episode is complete")
+    rewards, costs = (
+        columns.per_step(found[key], f"{path}: '{key}'", (len(obs),)) if key in found else None
+        for key in ("rewards", "costs")
+    )
     arrays = {
-        "obs": found["observations"],
-        "actions": found["actions"],
-        "rewards": found.get("rewards"),
-        "costs": found.get("costs"),
+        "obs": obs,
+        "actions": columns.rows(found["actions"], f"{path}: 'actions'", len(obs)),
+        "rewards": rewards,
+        "costs": costs,
         "terminated": terminated,
         "truncated": truncated,
     }
@@ -133,7 +143,9 @@ def _minari_facts(path: Path) -> dict[str, str]:
     try:
         if not path.is_file() or path.stat().st_size > MAX_METADATA_BYTES:
             raise ValueError("not a small file")
-        facts = json.loads(path.read_text(encoding="utf-8"))
+        facts = json.loads(path.read_text(encoding="utf-8-sig"))
+        if not isinstance(facts, dict):
+            raise TypeError("not an object")
         return {key: str(facts[key])[:200] for key in ("dataset_id", "minari_version") if key in facts}
     except (OSError, ValueError, TypeError, RecursionError):
         raise ArchiveError(f"{path}: not a JSON object of at most {MAX_METADATA_BYTES} bytes; copy it again") from None
@@ -145,40 +157,62 @@ def _minari(found: Mapping[str, np.ndarray], path: Path) -> Arrays:
     if not episodes:
         raise ArchiveError(f"{path}: holds no episode; copy the dataset again")
 
-    def column(key: str) -> np.ndarray | None:
+    def joined(key: str) -> np.ndarray | None:
         parts = [episode[key] for episode in episodes]
-        return None if any(part is None for part in parts) else _join(parts, key, path)
+        without = [name for name, part in zip(names, parts, strict=True) if part is None]
+        if 0 < len(without) < len(names):
+            raise ArchiveError(f"{path}: '{without[0]}' has no {key}, other episodes have; record it again")
+        return None if without else _join(parts, key, path)
 
     keys = ("obs", "actions", "rewards", "costs", "terminated", "truncated")
     ends = np.cumsum([len(episode["actions"]) for episode in episodes])
-    return {**{key: column(key) for key in keys}, "episode_ends": ends, "metadata": {"format": "minari"}}
+    return {**{key: joined(key) for key in keys}, "episode_ends": ends, "metadata": {"format": "minari"}}
 
 
 def _episode(found: Mapping[str, np.ndarray], name: str, path: Path) -> Arrays:
     """One episode of T steps. Observations have T + 1 rows; so may infos, as the reset has one too."""
-    where = f"{path}: '{name}"
+
+    def where(key: str) -> str:
+        return f"{path}: '{name}/{key}'"
+
     for key in ("observations", "actions", "terminations", "truncations"):
-        if found.get(f"{name}/{key}", np.zeros(())).ndim == 0:
-            raise ArchiveError(f"{where}/{key}' is missing or no array; only plain arrays of steps can be used")
-    num_steps = len(found[f"{name}/actions"])
-    cost = next(
-        (found[f"{name}/{key}"] for key in ("infos/cost", "infos/costs", "costs") if f"{name}/{key}" in found), None
-    )
-    if cost is not None and cost.ndim == 1 and len(cost) == num_steps + 1:
-        cost = cost[1:]
-    steps: Arrays = {
-        "obs": found[f"{name}/observations"][:-1],
-        "actions": found[f"{name}/actions"],
-        "rewards": found.get(f"{name}/rewards"),
-        "costs": cost,
-        "terminated": _flags(found[f"{name}/terminations"], f"{name}/terminations", path),
-        "truncated": _flags(found[f"{name}/truncations"], f"{name}/truncations", path),
+        if f"{name}/{key}" not in found:
+            raise ArchiveError(f"{where(key)} is missing; only plain arrays of steps can be used")
+    actions = columns.rows(found[f"{name}/actions"], where("actions"))
+    length = len(actions)
+    if length == 0:
+        raise ArchiveError(f"{where('actions')} has no rows: an episode without steps; remove that episode")
+    rewards = found.get(f"{name}/rewards")
+    return {
+        "obs": columns.rows(found[f"{name}/observations"], where("observations"), length + 1)[:-1],
+        "actions": actions,
+        "rewards": None if rewards is None else columns.per_step(rewards, where("rewards"), (length,)),
+        "costs": _episode_costs(found, name, length, path),
+        "terminated": columns.flags(found[f"{name}/terminations"], where("terminations"), (length,)),
+        "truncated": columns.flags(found[f"{name}/truncations"], where("truncations"), (length,)),
     }
-    for key, array in steps.items():
-        if array is not None and (array.ndim == 0 or len(array) != num_steps):
-            rows = "one row" if array.ndim == 0 else f"{len(array)} rows"
-            raise ArchiveError(f"{where}': '{key}' has {rows}, must have {num_steps}, one for each action")
-    return steps
+
+
+def _episode_costs(found: Mapping[str, np.ndarray], name: str, length: int, path: Path) -> np.ndarray | None:
+    """The costs of an episode's steps, without the reset's. Several arrays may hold them if they agree.
+
+    An array of several numbers a step, such as the terms of a cost, is no candidate beside one of one number a step.
+    """
+    present = {f"{name}/{key}": found[f"{name}/{key}"] for key in hdf5_child.COST_KEYS if f"{name}/{key}" in found}
+    single = {key: array for key, array in present.items() if array.ndim and array.size == len(array)}
+    costs = {
+        key: columns.per_step(array, f"{path}: '{key}'", (length, length + 1))
+        for key, array in (single or present).items()
+    }
+    steps = {key: column[len(column) - length :] for key, column in costs.items()}
+    for (first, ours), (second, theirs) in itertools.pairwise(steps.items()):
+        if not np.array_equal(ours, theirs):
+            raise ArchiveError(_contradiction(f"{path}: '{first}'", second))
+    return next(iter(steps.values()), None)
+
+
+def _contradiction(first: str, second: str) -> str:
+    return f"{first} and '{second}' hold different costs of the same steps; remove the one that is not the task's cost"
 
 
 def _flags_at_ends(lengths: Sequence[int]) -> Arrays:
@@ -187,34 +221,31 @@ def _flags_at_ends(lengths: Sequence[int]) -> Arrays:
     return {"terminated": unknown, "truncated": unknown, "episode_ends": np.cumsum(lengths, dtype=np.int64)}
 
 
-def _rows(part: np.ndarray) -> np.ndarray:
-    """[T, ...] as [T, columns]; a vector is one column."""
-    return part.reshape(len(part), -1) if len(part) else part
+def _of(path: Path, key: str, trajectory: int) -> str:
+    return f"{path}: '{key}' of trajectory {trajectory}"
 
 
-def _columns(parts: Sequence[np.ndarray], lengths: Sequence[int], key: str, path: Path) -> list[np.ndarray]:
-    """Each part as [T]; [T, 1] is taken too."""
-    for i, (part, length) in enumerate(zip(parts, lengths, strict=True)):
-        if part.ndim == 0 or len(part) != length or part.size != length:
-            raise ArchiveError(f"{path}: '{key}' has shape {part.shape}, 'obs' has {length} rows (trajectory {i})")
-    return [part.reshape(-1) for part in parts]
+def _flat(part: np.ndarray, where: str) -> np.ndarray:
+    """[T, ...] as [T, columns], as the readers of those projects have it; a vector is one column."""
+    return columns.rows(part.reshape(len(part), -1) if part.ndim > 2 and part.size else part, where)
+
+
+def _per_trajectory(
+    found: Mapping[str, Sequence[np.ndarray]], key: str, lengths: Sequence[int], path: Path
+) -> list[np.ndarray] | None:
+    """[T] of each trajectory; None without that key."""
+    if key not in found:
+        return None
+    parts = zip(found[key], lengths, strict=True)
+    return [columns.per_step(part, _of(path, key, i), (length,)) for i, (part, length) in enumerate(parts)]
 
 
 def _join(parts: Sequence[np.ndarray], key: str, path: Path) -> np.ndarray:
     """The parts end to end."""
     for i, part in enumerate(parts):
-        if part.dtype.kind not in "biuf":
-            raise ArchiveError(f"{path}: '{key}' has dtype {part.dtype}, must be number (trajectory {i}); convert it")
-        if part.ndim == 0 or part.shape[1:] != parts[0].shape[1:]:
+        if part.shape[1:] != parts[0].shape[1:]:
             raise ArchiveError(
-                f"{path}: '{key}' has shape {part.shape}, trajectory 0 has {parts[0].shape} (trajectory {i}); "
+                f"{_of(path, key, i)} has shape {part.shape}, trajectory 0 has {parts[0].shape}; "
                 "only their lengths may differ"
             )
     return np.concatenate(parts) if parts else np.zeros(0)
-
-
-def _flags(array: np.ndarray, key: str, path: Path) -> np.ndarray:
-    """Booleans, also where they were stored as the numbers 0 and 1."""
-    if array.dtype.kind not in "biuf" or array.ndim != 1 or not np.isin(array, (0, 1)).all():
-        raise ArchiveError(f"{path}: '{key}' is not a row of flags; it may hold 0 and 1 only")
-    return array.astype(np.bool_)

@@ -1,4 +1,4 @@
-"""The process that reads one HDF5 file (argument 1) and writes what it holds as `.npz` (argument 2).
+"""The process that reads one HDF5 file (argument 1) and writes what it holds as `.npz` to a descriptor (argument 2).
 
 The HDF5 library is C and meets damaged files with crashes, endless loops and huge allocations; here they end a process
 that has nothing to lose. Links, external storage and virtual datasets, which make one file read another, are refused.
@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-REFUSED = 3  # exit status: stderr holds one line that says why
+REFUSED, NOT_WRITTEN = 3, 4  # exit status: stderr holds one line that says why
+COST_KEYS = ("infos/cost", "infos/costs", "costs")  # where an episode of Minari may have its costs
 CPU_SECONDS = 120
 MAX_ENTRIES = 100_000
 _NAME = re.compile(
@@ -26,35 +27,52 @@ class RefusedError(Exception):
     """One line: the entry and what is wrong with it."""
 
 
-def extract(path: Path, out: Path, max_bytes: int) -> None:
-    """Writes the known datasets of `path` to the archive `out`, `max_bytes` of them at most. Raises `RefusedError`."""
+def extract(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
+    """The known datasets of `path`, `max_bytes` of them at most. Raises `RefusedError`."""
     import h5py
 
     with h5py.File(path, "r", locking=False) as file:
-        datasets = dict(_datasets(file))
+        datasets = _datasets(file)
         total = 0
         for name, dataset in datasets.items():
             _check(name, dataset, max_bytes)
             total += dataset.size * dataset.dtype.itemsize
         if total > max_bytes:
             raise RefusedError(f"holds {total} bytes, limit {max_bytes}; use fewer episodes")
-        np.savez(out, allow_pickle=False, **{name: dataset[()] for name, dataset in datasets.items()})
+        return {name: dataset[()] for name, dataset in datasets.items()}
 
 
-def _datasets(file: Any) -> Iterator[tuple[str, Any]]:
-    """The datasets whose names we know. Looks at a link before it follows it."""
+def _datasets(file: Any) -> dict[str, Any]:
+    """The datasets whose names we know. What only shares the name of costs does not matter beside them."""
+    entries = dict(_entries(file))
+    complaints = {name: complaint for name, entry in entries.items() if (complaint := _no_array(entry))}
+    arrays = {name: entry for name, entry in entries.items() if name not in complaints}
+    for name, complaint in complaints.items():
+        episode, _, key = name.partition("/")
+        if key not in COST_KEYS or not any(f"{episode}/{other}" in arrays for other in COST_KEYS):
+            raise RefusedError(f"'{name}' {complaint}")
+    return arrays
+
+
+def _no_array(entry: Any) -> str | None:
+    """What keeps `entry` from being an array of numbers."""
     import h5py
 
+    if not isinstance(entry, h5py.Dataset):
+        return "is not an array but a group; only plain arrays can be used"
+    if entry.shape is None or entry.dtype.kind not in "biuf" or entry.dtype.itemsize > 16:
+        return f"has dtype {str(entry.dtype)[:60]}, must be a number; convert it and save again"
+    return None
+
+
+def _entries(file: Any) -> Iterator[tuple[str, Any]]:
+    """What has a name that we know. Looks at a link before it follows it."""
     for group in _groups(file):
         for name in group:
             full = f"{group.name}/{name}".strip("/")
-            if not _NAME.fullmatch(full):
-                continue
-            _check_link(group, name, full)
-            entry = group[name]
-            if not isinstance(entry, h5py.Dataset):
-                raise RefusedError(f"'{full}' is not an array; only plain arrays can be used")
-            yield full, entry
+            if _NAME.fullmatch(full):
+                _check_link(group, name, full)
+                yield full, group[name]
 
 
 def _groups(file: Any) -> Iterator[Any]:
@@ -89,8 +107,6 @@ def _check(name: str, dataset: Any, max_bytes: int) -> None:
     layout = dataset.id.get_create_plist()
     if dataset.is_virtual or layout.get_external_count():
         raise RefusedError(f"'{name}' is kept in other files, refused; copy the data in")
-    if dataset.shape is None or dataset.dtype.kind not in "biuf" or dataset.dtype.itemsize > 16:
-        raise RefusedError(f"'{name}' has dtype {str(dataset.dtype)[:60]}, must be a number; convert it and save again")
     filters = {layout.get_filter(i)[0] for i in range(layout.get_nfilters())}
     if not filters <= _FILTERS:
         raise RefusedError(
@@ -124,11 +140,11 @@ def limit_resources(max_bytes: int) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Reads argument 0, writes argument 1, argument 2 is the limit in bytes; returns the exit status."""
-    path, out, max_bytes = Path(arguments[0]), Path(arguments[1]), int(arguments[2])
+    """Reads file 0, writes to the open descriptor 1, argument 2 is the limit in bytes; returns the exit status."""
+    path, descriptor, max_bytes = Path(arguments[0]), int(arguments[1]), int(arguments[2])
     limit_resources(max_bytes)
     try:
-        extract(path, out, max_bytes)
+        arrays = extract(path, max_bytes)
     except RefusedError as error:
         print(error, file=sys.stderr)
         return REFUSED
@@ -138,6 +154,12 @@ def main(arguments: Sequence[str]) -> int:
     except Exception:  # noqa: BLE001  (h5py turns the library's complaints into many types)
         print("truncated or damaged HDF5 file; copy or record it again", file=sys.stderr)
         return REFUSED
+    try:
+        with open(descriptor, "wb", closefd=False) as out:
+            np.savez(out, allow_pickle=False, **arrays)
+    except (OSError, MemoryError) as error:
+        print(getattr(error, "strerror", None) or "out of memory", file=sys.stderr)
+        return NOT_WRITTEN
     return 0
 
 

@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -60,32 +60,45 @@ def read(
     messages about archives of a wrong kind.
     """
     _check_kind(path, remedy)
+    return read_open(path, str(path), keys, optional=optional, remedy=remedy, read_objects=read_objects)
+
+
+def read_open(
+    source: Path | BinaryIO,
+    name: str,
+    keys: Iterable[str],
+    *,
+    optional: frozenset[str] = frozenset(),
+    remedy: str,
+    read_objects: ObjectReader | None = None,
+) -> dict[str, np.ndarray]:
+    """As `read`, of an open file, or of one that is known to be an archive; the messages call it `name`."""
     arrays: dict[str, np.ndarray] = {}
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(source) as archive:
             members = {info.filename: info for info in archive.infolist()}
             total = sum(info.file_size for info in members.values())
             if total > MAX_BYTES:
-                raise ArchiveError(f"{path}: unpacks to {total} bytes, limit {MAX_BYTES}; use fewer episodes")
+                raise ArchiveError(f"{name}: unpacks to {total} bytes, limit {MAX_BYTES}; use fewer episodes")
             for key in keys:
                 info = members.get(f"{key}.npy")
                 if info is not None:
-                    arrays[key] = _read_array(archive, info, f"{path}: '{key}'", remedy, read_objects)
+                    arrays[key] = _read_array(archive, info, f"{name}: '{key}'", remedy, read_objects)
                 elif key not in optional:
-                    raise ArchiveError(f"{path}: key '{key}' is missing; {remedy}")
+                    raise ArchiveError(f"{name}: key '{key}' is missing; {remedy}")
     except ArchiveError:
         raise
     except OSError as error:
-        raise ArchiveError(f"{path}: cannot be read ({error.strerror}); check the path and rights") from None
+        raise ArchiveError(f"{name}: cannot be read ({error.strerror}); check the path and rights") from None
     except _DAMAGE:
-        raise ArchiveError(f"{path}: truncated or damaged .npz archive; copy or record it again") from None
+        raise ArchiveError(f"{name}: truncated or damaged .npz archive; copy or record it again") from None
     return arrays
 
 
-def keys_of(path: Path) -> frozenset[str]:
+def keys_of(source: Path | BinaryIO) -> frozenset[str]:
     """Names of the arrays in an archive; none for what is no archive."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(source) as archive:
             return frozenset(name.removesuffix(".npy") for name in archive.namelist())
     except _DAMAGE:
         return frozenset()
@@ -111,7 +124,9 @@ def _check_kind(path: Path, remedy: str) -> None:
     if not path.exists():
         raise ArchiveError(f"{path}: no such file; check the path")
     if not path.is_file():
-        raise ArchiveError(f"{path}: not a file, and no Minari dataset (data/main_data.hdf5); give the file itself")
+        raise ArchiveError(
+            f"{path}: not a file, and no Minari dataset in HDF5 (data/main_data.hdf5); give the file itself"
+        )
     try:
         with path.open("rb") as file:
             start = file.read(2)

@@ -45,15 +45,20 @@ def run(arguments: argparse.Namespace) -> None:
     check_matches(demonstrations, arguments.file, task)
     command_line.check_writable(out.parent, "--out")
     facts = {"task": task.name, "source": arguments.file.name, "command": command_line.command()}
-    save_demonstrations(out, dataclasses.replace(demonstrations, metadata={**demonstrations.metadata, **facts}))
+    try:
+        save_demonstrations(out, dataclasses.replace(demonstrations, metadata={**demonstrations.metadata, **facts}))
+    except OSError as error:
+        raise UsageError(f"--out {out}: cannot be written ({error.strerror}); make space or choose another") from None
     print(_summary(demonstrations, out))
 
 
 def _summary(demonstrations: Demonstrations, out: Path) -> str:
-    mean_return = demonstrations.mean_episode_return
+    mean_return, actions = demonstrations.mean_episode_return, demonstrations.actions
     return (
-        f"{out}: {demonstrations.num_episodes} trajectories, {demonstrations.num_steps} steps, mean return "
-        f"{'unknown' if mean_return is None else f'{mean_return:g}'}, mean cost {demonstrations.mean_episode_cost:g}"
+        f"{out}: {demonstrations.num_episodes} trajectories, {demonstrations.num_steps} steps (at most "
+        f"{demonstrations.episode_lengths.max()} each), mean return "
+        f"{'unknown' if mean_return is None else f'{mean_return:g}'}, mean cost {demonstrations.mean_episode_cost:g}, "
+        f"actions from {actions.min():g} to {actions.max():g}"
     )
 
 

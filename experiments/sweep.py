@@ -60,9 +60,13 @@ def read_spec(path: Path) -> dict[str, Any]:
     if path.suffix not in loaders:
         raise UsageError(f"SPEC {path}: give a file named *.toml or *.json")
     try:
-        spec = loaders[path.suffix](path.read_text(encoding="utf-8"))
+        spec = loaders[path.suffix](path.read_text(encoding="utf-8-sig"))  # editors may write a byte order mark
     except OSError as error:
         raise UsageError(f"SPEC {path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"SPEC {path}: not text in UTF-8; save it with that encoding") from None
+    except RecursionError:
+        raise UsageError(f"SPEC {path}: nested too deeply; give a table with {', '.join(_KEYS)}") from None
     except ValueError as error:
         raise UsageError(f"SPEC {path}: not {path.suffix[1:].upper()} ({error})") from None
     if not isinstance(spec, dict):

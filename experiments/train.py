@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ccil_jax.config import Config, with_limit_of
-from ccil_jax.demonstrations import Demonstrations, check_matches, load_demonstrations
+from ccil_jax.demonstrations import Demonstrations, check_matches, check_time_limit, load_demonstrations
 from ccil_jax.methods import METHODS
 from envs.registry import TaskInfo
 from experiments import command_line, options
@@ -123,7 +123,10 @@ def find_demonstrations(
             raise UsageError(f"{path}: recorded with {name} {recorded}, this run has {used}; use {option}")
     if count is not None and count > demonstrations.num_episodes:
         raise UsageError(f"--num-demos {count}: {path} holds {demonstrations.num_episodes}; give at most that many")
-    return path, demonstrations if count is None else demonstrations.take_episodes(count)
+    if count is not None:
+        demonstrations = demonstrations.take_episodes(count)
+    check_time_limit(demonstrations, path, env_options["max_episode_steps"])
+    return path, demonstrations
 
 
 def _shipped(task: str) -> Path:

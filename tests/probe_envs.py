@@ -148,12 +148,12 @@ class Conflict(Probe):
 
 
 def walk_demonstrations() -> Demonstrations:
-    """40 made-up steps of `Walk` in episodes of unequal lengths and costs; J_E = (3 + 1.5 + 2.25) / 3."""
+    """40 made-up steps of `Walk` in episodes of unequal lengths and costs; J_E = (6 + 3 + 0.5 + 4) / 6."""
     rng = np.random.default_rng(0)
-    ends = np.array([10, 25, 40])
+    ends = np.array([7, 13, 20, 27, 33, 40])  # none longer than an episode of `Walk`
     last = np.isin(np.arange(40), ends - 1)
     costs = np.zeros(40, np.float32)
-    costs[[2, 5, 12, 30, 39]] = [2.0, 1.0, 1.5, 0.25, 2.0]
+    costs[[2, 5, 12, 30, 39]] = [4.0, 2.0, 3.0, 0.5, 4.0]
     return Demonstrations(
         obs=rng.normal(size=(40, 2)).astype(np.float32),
         actions=rng.uniform(-1, 1, (40, 1)).astype(np.float32),

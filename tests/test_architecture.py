@@ -25,6 +25,7 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in SOU
 ORDER = (
     "tabular",
     "npz",
+    "columns",
     "legacy_npz",
     "hdf5_child",
     "hdf5",

@@ -17,8 +17,9 @@ SLOPE, STD = np.array([0.5, -0.3]), 0.2
 
 
 def linear_expert(num_steps: int) -> Demonstrations:
-    """Actions drawn from N(0.1 + SLOPE . obs, STD^2), in one long episode."""
+    """Actions drawn from N(0.1 + SLOPE . obs, STD^2), in episodes as long as those of `Walk`."""
     rng = np.random.default_rng(0)
+    ends = np.append(np.arange(Walk.max_episode_steps, num_steps, Walk.max_episode_steps), num_steps)
     obs = rng.normal(size=(num_steps, 2))
     actions = 0.1 + obs @ SLOPE[:, None] + STD * rng.normal(size=(num_steps, 1))
     return dataclasses.replace(
@@ -27,8 +28,8 @@ def linear_expert(num_steps: int) -> Demonstrations:
         actions=actions.astype(np.float32),
         costs=np.zeros(num_steps, np.float32),
         terminated=np.zeros(num_steps, bool),
-        truncated=np.arange(num_steps) == num_steps - 1,
-        episode_ends=np.array([num_steps]),
+        truncated=np.isin(np.arange(num_steps), ends - 1),
+        episode_ends=ends,
     )
 
 

@@ -14,9 +14,12 @@ from ccil_jax.demonstrations import (
     Demonstrations,
     DemonstrationsError,
     check_matches,
+    check_time_limit,
     load_demonstrations,
     save_demonstrations,
 )
+from experiments import train
+from experiments.training import Plan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +103,11 @@ def test_file_round_trip_is_exact_and_reproducible(tmp_path: Path) -> None:
 def test_other_layouts_of_sound_data_are_read(tmp_path: Path) -> None:
     text = np.frombuffer(json.dumps({"task": "Swimmer"}).encode(), np.uint8)
     obs = np.asfortranarray(make().obs.astype(np.float64))
-    loaded = load_demonstrations(write(tmp_path / "d.npz", obs=obs, costs=np.ones(6, np.int32), metadata=text))
+    ends = np.array([2.0, 5.0, 6.0])
+    path = write(tmp_path / "d.npz", obs=obs, costs=np.ones(6, np.int32), episode_ends=ends, metadata=text)
+    loaded = load_demonstrations(path)
+    np.testing.assert_array_equal(loaded.episode_ends, [2, 5, 6])
+    assert loaded.episode_ends.dtype == np.int64
     np.testing.assert_array_equal(loaded.obs, make().obs)
     np.testing.assert_array_equal(loaded.costs, np.ones(6))
     assert loaded.metadata == {"task": "Swimmer"}
@@ -130,12 +137,22 @@ def nan_at(array: np.ndarray, row: int, value: float = np.nan) -> np.ndarray:
 BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
     "missing key": ({"remove": "costs"}, "key 'costs' is missing"),
     "missing metadata": ({"remove": "metadata"}, "key 'metadata' is missing"),
-    "rank": ({"obs": np.zeros(48)}, "'obs' has shape"),
+    "rank": ({"obs": np.zeros((6, 2, 4))}, r"'obs' has shape \(6, 2, 4\), must have shape \(rows, columns\)"),
+    "no axis": ({"costs": np.zeros(())}, r"'costs' has shape \(\), must have one axis"),
+    "costs in a row": ({"costs": np.zeros((1, 6))}, r"'costs' has shape \(1, 6\), must have shape \(1,\)"),
+    "vector of another length": ({"obs": np.zeros(48)}, "'actions' has 6 rows, 'obs' has 48"),
     "no columns": ({"actions": np.zeros((6, 0))}, "'actions' has no columns"),
     "text": ({"obs": np.full((6, 8), "x")}, "'obs' has dtype"),
     "complex": ({"costs": np.zeros(6, complex)}, "'costs' has dtype"),
-    "flags as numbers": ({"terminated": np.zeros(6)}, "'terminated' has dtype"),
-    "ends as floats": ({"episode_ends": np.array([2.0, 5.0, 6.0])}, "'episode_ends' has dtype"),
+    "flags as text": ({"terminated": np.full(6, "no")}, "'terminated' has dtype <U2, must be a number"),
+    "flags beyond 1": (
+        {"terminated": np.array([0, 1, 0, 0, 0, 2])},
+        r"'terminated' holds 2 \(row 5\), must hold flags: true and false, or 1 and 0",
+    ),
+    "ends between rows": (
+        {"episode_ends": np.array([2.0, 5.5, 6.0])},
+        r"'episode_ends' holds 5\.5 \(entry 1\), must hold integers",
+    ),
     "lengths": ({"actions": np.zeros((5, 2))}, "'actions' has 5 rows, 'obs' has 6"),
     "empty": (
         {
@@ -189,6 +206,33 @@ def test_files_of_another_task_or_size_are_refused() -> None:
         check_matches(make(), "d.npz", Task(obs_dim=17))
     with pytest.raises(DemonstrationsError, match=r"d\.npz: 'actions' has 2 columns, Swimmer has action_dim 6"):
         check_matches(make(), "d.npz", Task(action_dim=6))
+
+
+def test_trajectories_longer_than_an_episode_are_refused() -> None:
+    check_time_limit(make(), "d.npz", 3)  # its trajectories have 2, 3 and 1 steps
+    message = r"d\.npz: trajectory 1 has 3 steps, an episode of this run has at most 2; .* use --max-episode-steps 3 "
+    with pytest.raises(DemonstrationsError, match=message):
+        check_time_limit(make(), "d.npz", 2)
+
+
+def test_training_refuses_trajectories_longer_than_its_episodes(tmp_path: Path) -> None:
+    """Of any file, as only ours say under which time limit they were recorded; of those that are used."""
+    save_demonstrations(tmp_path / "d.npz", make(metadata={}))
+    parser = train.make_parser()
+
+    def plan(*options: str) -> Plan:
+        given = ["--method", "ccil", "--env", "Swimmer", "--demos", str(tmp_path / "d.npz"), *options]
+        return train.make_plan(parser.parse_args([*given, "--out", str(tmp_path / "run")]))
+
+    assert plan("--max-episode-steps", "3").demonstrations is not None
+    assert plan("--max-episode-steps", "2", "--num-demos", "1").demonstrations is not None
+    with pytest.raises(DemonstrationsError, match=r"d\.npz: trajectory 1 has 3 steps, .* at most 2; "):
+        plan("--max-episode-steps", "2")
+
+
+def test_a_missing_array_is_refused_when_saved(tmp_path: Path) -> None:
+    with pytest.raises(DemonstrationsError, match=r"d\.npz: 'costs' has dtype object, must be a number"):
+        save_demonstrations(tmp_path / "d.npz", make(costs=None))
 
 
 def test_importing_the_package_imports_no_jax() -> None:

@@ -1,14 +1,20 @@
 """Sound files of other formats: every number arrives, in the right row, and the converter writes what was read."""
 
+import contextlib
+import errno
+import io
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
 import pytest
 
-from ccil_jax.demonstrations import DemonstrationsError, load_demonstrations
+from ccil_jax import hdf5, hdf5_child
+from ccil_jax.demonstrations import Demonstrations, DemonstrationsError, load_demonstrations, save_demonstrations
 from experiments import convert
 
 LENGTHS = (3, 4, 2)
@@ -111,6 +117,204 @@ def assert_arrived(path: Path, *, flags: bool) -> None:
     assert np.flatnonzero(found.truncated).tolist() == ([6, 8] if flags else [])
 
 
+@pytest.fixture
+def hdf5_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reader of HDF5 without the process that protects us from strangers' files: these are our own, and many."""
+
+    def run_child(arguments: Sequence[str]) -> tuple[int, str]:
+        with contextlib.redirect_stderr(io.StringIO()) as complaint:
+            return hdf5_child.main(arguments), complaint.getvalue().strip()
+
+    monkeypatch.setattr(hdf5_child, "limit_resources", lambda max_bytes: None)
+    monkeypatch.setattr(hdf5, "run_child", run_child)
+
+
+ENDS = np.array([3, 6])  # of the two episodes that the writers below split their arrays into
+SOUND: dict[str, np.ndarray] = {
+    "obs": np.arange(48.0).reshape(6, 8),
+    "actions": np.linspace(-1, 1, 12).reshape(6, 2),
+    "rewards": np.array([1.0, 0, 0, 1, 1, 0]),
+    "costs": np.array([0.0, 1, 1, 0, 0, 1]),
+    "terminated": np.zeros(6, bool),
+    "truncated": np.isin(np.arange(6), ENDS - 1),
+}
+
+
+def write_own(folder: Path, arrays: dict[str, np.ndarray]) -> Path:
+    np.savez(folder / "own.npz", **arrays, episode_ends=ENDS[:, None], metadata=np.array("{}"))
+    return folder / "own.npz"
+
+
+def write_saved(folder: Path, arrays: dict[str, np.ndarray]) -> Path:
+    save_demonstrations(folder / "saved.npz", Demonstrations(**arrays, episode_ends=ENDS[:, None]))
+    return folder / "saved.npz"
+
+
+def write_baselines(folder: Path, arrays: dict[str, np.ndarray]) -> Path:
+    names = {"obs": "obs", "acs": "actions", "rews": "rewards", "costs": "costs"}
+    np.savez(folder / "b.npz", **{new: np.stack(np.split(arrays[old], ENDS[:1])) for new, old in names.items()})
+    return folder / "b.npz"
+
+
+def write_dsrl(folder: Path, arrays: dict[str, np.ndarray]) -> Path:
+    names = {"obs": "observations", "terminated": "terminals", "truncated": "timeouts"}
+    with h5py.File(folder / "d.hdf5", "w") as file:
+        file.update({names.get(key, key): array for key, array in arrays.items()})
+    return folder / "d.hdf5"
+
+
+def write_minari(folder: Path, arrays: dict[str, np.ndarray]) -> Path:
+    """With a reset that costs NaN, where the type of the costs knows it, or else 7."""
+    names = {"obs": "observations", "terminated": "terminations", "truncated": "truncations", "costs": "infos/cost"}
+    (folder / "m" / "data").mkdir(parents=True)
+    with h5py.File(folder / "m" / "data" / "main_data.hdf5", "w") as file:
+        for key, array in arrays.items():
+            for i, part in enumerate(np.split(array, ENDS[:1])):
+                row = np.full((1, *part.shape[1:]), np.nan if part.dtype.kind == "f" else 7).astype(part.dtype)
+                parts = {"costs": [row, part], "obs": [part, np.zeros_like(row)]}.get(key, [part])
+                file[f"episode_{i}/{names.get(key, key)}"] = np.concatenate(parts)
+    return folder / "m"
+
+
+WRITERS: dict[str, Callable[[Path, dict[str, np.ndarray]], Path]] = {
+    "own": write_own,
+    "saved": write_saved,
+    "baselines": write_baselines,
+    "dsrl": write_dsrl,
+    "minari": write_minari,
+}
+NAMES = {  # what a format calls costs, rewards and flags; baselines know no flags
+    "own": ("costs", "rewards", "truncated"),
+    "saved": ("costs", "rewards", "truncated"),
+    "baselines": ("costs' of trajectory 0", "rews' of trajectory 0", None),
+    "dsrl": ("costs", "rewards", "timeouts"),
+    "minari": ("episode_0/infos/cost", "episode_0/rewards", "episode_0/truncations"),
+}
+
+
+def assert_sound(found: Demonstrations, *, flags: bool) -> None:
+    for key in ("obs", "actions", "rewards", "costs"):
+        np.testing.assert_array_equal(getattr(found, key), SOUND[key].astype(np.float32))
+        assert getattr(found, key).dtype == np.float32
+    np.testing.assert_array_equal(found.episode_ends, ENDS)
+    assert found.truncated.tolist() == (SOUND["truncated"].tolist() if flags else [False] * 6)
+    assert found.truncated.dtype == np.bool_
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+@pytest.mark.parametrize("writer", WRITERS)
+@pytest.mark.parametrize("kind", [np.bool_, np.uint8, np.int64, np.float32])
+@pytest.mark.parametrize("in_columns", [False, True])
+def test_numbers_and_flags_of_every_kind_are_the_same(
+    tmp_path: Path, writer: str, kind: type, in_columns: bool
+) -> None:
+    arrays = {**SOUND, **{key: SOUND[key].astype(kind) for key in SOUND if SOUND[key].ndim == 1}}
+    if in_columns:
+        arrays = {
+            key: array[:, None] for key, array in arrays.items()
+        }  # also [6, 1, 8], of one environment side by side
+    assert_sound(load_demonstrations(WRITERS[writer](tmp_path, arrays)), flags=writer != "baselines")
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+@pytest.mark.parametrize("writer", WRITERS)
+def test_vectors_are_one_column(tmp_path: Path, writer: str) -> None:
+    arrays = {**SOUND, "obs": np.arange(6.0), "actions": np.linspace(-1, 1, 6)}
+    found = load_demonstrations(WRITERS[writer](tmp_path, arrays))
+    np.testing.assert_array_equal(found.obs, np.arange(6, dtype=np.float32)[:, None])
+    np.testing.assert_array_equal(found.actions, np.linspace(-1, 1, 6, dtype=np.float32)[:, None])
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+@pytest.mark.parametrize("writer", WRITERS)
+def test_several_values_a_step_are_refused_by_name_and_shape(tmp_path: Path, writer: str) -> None:
+    for key, name in zip(("costs", "rewards", "truncated"), NAMES[writer], strict=True):
+        if name is not None:
+            (tmp_path / key).mkdir()
+            wide = np.repeat(SOUND[key][:, None], 2, axis=1)
+            with pytest.raises(DemonstrationsError, match=rf"'{name}.* has shape \(\d, 2\), must have shape \(\d,\)"):
+                load_demonstrations(WRITERS[writer](tmp_path / key, {**SOUND, key: wide}))
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+@pytest.mark.parametrize("writer", [name for name in WRITERS if NAMES[name][2]])
+def test_flags_other_than_0_and_1_are_refused(tmp_path: Path, writer: str) -> None:
+    arrays = {**SOUND, "truncated": np.array([0, 0, 2, 0, 0, 1.0])}
+    with pytest.raises(DemonstrationsError, match=rf"'{NAMES[writer][2]}' holds 2\.0 \(row 2\), must hold flags"):
+        load_demonstrations(WRITERS[writer](tmp_path, arrays))
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+@pytest.mark.parametrize("cost", [np.array([0, 0, 1, 1, 9.0]), np.zeros((4, 3)), np.array([b"x"] * 4), None])
+def test_what_only_shares_the_name_of_costs_does_not_matter(tmp_path: Path, cost: np.ndarray | None) -> None:
+    """A group, text or an array of several terms beside the costs; but not a second array of costs."""
+    folder = write_minari(tmp_path, SOUND)
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        file["episode_0/infos/event"] = np.array([b"a"] * 4)
+        if cost is None:
+            file["episode_0/infos/costs/hazard"] = np.ones(4)
+        else:
+            file["episode_0/infos/costs"] = cost
+    if cost is not None and cost.dtype.kind == "f" and cost.ndim == 1:
+        with pytest.raises(DemonstrationsError, match=r"'episode_0/infos/costs' has shape \(5,\)"):
+            load_demonstrations(folder)
+    else:
+        assert_sound(load_demonstrations(folder), flags=True)
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+def test_two_arrays_of_costs_must_agree(tmp_path: Path) -> None:
+    folder = write_minari(tmp_path, SOUND)
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        file["episode_0/costs"] = SOUND["costs"][:3, None]
+    assert_sound(load_demonstrations(folder), flags=True)
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        file["episode_0/costs"][...] = 1 - SOUND["costs"][:3, None]
+    with pytest.raises(DemonstrationsError, match="'episode_0/infos/cost' and 'episode_0/costs' hold different costs"):
+        load_demonstrations(folder)
+    both = legacy(tmp_path / "both.npz", costs=objects(COSTS))
+    np.testing.assert_array_equal(load_demonstrations(both).costs, np.concatenate(COSTS))
+    other = legacy(tmp_path / "other.npz", costs=objects([COSTS[0], COSTS[1], np.array([0, 1.0])]))
+    with pytest.raises(DemonstrationsError, match="'accucost' of trajectory 2 and 'costs' hold different costs"):
+        load_demonstrations(other)
+
+
+def test_a_default_cost_replaces_no_cost_that_the_file_has(tmp_path: Path) -> None:
+    folder = minari(tmp_path / "m")
+    with h5py.File(folder / "data" / "main_data.hdf5", "a") as file:
+        del file["episode_9/infos/cost"]
+    with pytest.raises(DemonstrationsError, match="'episode_9' has no costs, other episodes have"):
+        load_demonstrations(folder, default_cost=0.0)
+
+
+def test_totals_are_no_costs_of_steps(tmp_path: Path) -> None:
+    """[E] and [E, 1] are totals of the episodes; where every episode has one step, [E, 1] are its steps."""
+    for i, totals in enumerate((np.ones(3), np.ones((3, 1)))):
+        with pytest.raises(DemonstrationsError, match="holds no cost of each step"):
+            load_demonstrations(legacy(tmp_path / f"{i}.npz", accucost=None, costs=totals))
+    np.savez(tmp_path / "short.npz", obs=np.ones((3, 1, 8)), acs=np.ones((3, 1, 2)), costs=np.ones((3, 1)))
+    np.testing.assert_array_equal(load_demonstrations(tmp_path / "short.npz").episode_costs, np.ones(3))
+
+
+def test_other_arrays_in_our_own_file_do_not_matter(tmp_path: Path) -> None:
+    extra = {"acs": np.zeros((6, 9)), "infos": np.array(["x"] * 6), "notes": objects([{"a": 1}])}
+    assert_sound(load_demonstrations(write_own(tmp_path, {**SOUND, **extra})), flags=True)
+
+
+@pytest.mark.usefixtures("hdf5_in_this_process")
+def test_a_byte_order_mark_in_metadata_does_not_matter(tmp_path: Path) -> None:
+    folder = minari(tmp_path / "m")
+    facts = folder / "data" / "metadata.json"
+    facts.write_bytes(b"\xef\xbb\xbf" + facts.read_bytes())
+    assert load_demonstrations(folder).metadata["dataset_id"] == "swimmer/expert-v0"
+    arrays = {**SOUND, "episode_ends": ENDS}
+    for i, text in enumerate(
+        (np.array('\ufeff{"task": "Ant"}'), np.frombuffer(b'\xef\xbb\xbf{"task": "Ant"}', np.uint8))
+    ):
+        np.savez(tmp_path / f"{i}.npz", **arrays, metadata=text)
+        assert load_demonstrations(tmp_path / f"{i}.npz").metadata == {"task": "Ant"}
+
+
 @pytest.mark.parametrize("names", ["numpy._core", "numpy.core"])
 def test_object_arrays_of_either_numpy(tmp_path: Path, names: str) -> None:
     assert_arrived(legacy(tmp_path / "expert.npz", protocol_names=names), flags=False)
@@ -192,6 +396,23 @@ def test_the_converter_writes_what_was_read(tmp_path: Path, capsys: pytest.Captu
     assert "3 trajectories, 9 steps" in capsys.readouterr().out
     assert_arrived(out, flags=False)
     assert load_demonstrations(out).metadata["task"] == "Swimmer"
+
+
+def test_the_converter_says_what_a_run_must_allow(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = write_own(tmp_path, SOUND), tmp_path / "out.npz"
+    assert convert.main([str(path), "--env", "Swimmer", "--out", str(out)]) == 0
+    assert "6 steps (at most 3 each)" in capsys.readouterr().out
+
+
+def test_a_full_disk_ends_the_converter_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, out = write_own(tmp_path, SOUND), tmp_path / "out.npz"
+    monkeypatch.setattr(np, "savez_compressed", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
+    with pytest.raises(SystemExit) as end:
+        convert.main([str(path), "--env", "Swimmer", "--out", str(out)])
+    assert end.value.code == 2
+    assert f"--out {out}: cannot be written (No space left on device); make space" in capsys.readouterr().err
 
 
 def test_the_converter_answers_wrong_use_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,15 +1,22 @@
 """The child that reads HDF5: its limits hold, and however it ends the parent says so in one line."""
 
+import contextlib
+import functools
 import importlib.util
+import io
+import os
+import resource
 import subprocess
 import sys
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from ccil_jax import hdf5, npz
+from ccil_jax import hdf5, hdf5_child, npz
 from ccil_jax.npz import ArchiveError
 
 
@@ -56,6 +63,53 @@ def test_a_child_that_dies_hangs_or_cannot_be_is_reported(path: Path, monkeypatc
         patch.setattr(importlib.util, "find_spec", lambda name: None)
         with pytest.raises(ArchiveError, match="needs h5py; install it with"):
             hdf5.read(path)
+
+
+def test_no_temporary_folder_is_needed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(path.parent / "missing"))
+    monkeypatch.setenv("TMPDIR", str(path.parent / "missing"))
+    np.testing.assert_array_equal(hdf5.read(path)["actions"], np.arange(1024**2))
+
+
+def test_where_files_in_memory_are_unknown_the_temporary_folder_is_used(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "memfd_create")
+    folder = path.parent / "temporary"
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    with pytest.raises(ArchiveError, match=r"d\.hdf5: .* needs a temporary folder .* \(No such file.*TMPDIR"):
+        hdf5.read(path)
+    folder.mkdir()
+    np.testing.assert_array_equal(hdf5.read(path)["actions"], np.arange(1024**2))
+    assert list(folder.iterdir()) == []
+
+
+def test_a_full_folder_is_not_a_damaged_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "memfd_create")
+    monkeypatch.setattr(tempfile, "tempdir", str(path.parent))
+    monkeypatch.setattr(tempfile, "TemporaryFile", functools.partial(Path("/dev/full").open, "wb"))
+    message = (
+        rf"d\.hdf5: .* the temporary folder {path.parent} \(No space left on device\); make space there or set TMPDIR"
+    )
+    with pytest.raises(ArchiveError, match=message):
+        hdf5.read(path)
+
+
+def test_a_limit_on_file_sizes_is_not_a_damaged_file(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run_child(arguments: Sequence[str]) -> tuple[int, str]:
+        """In this process, as a test that runs as root could not keep the child from raising its limit."""
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+        try:
+            with contextlib.redirect_stderr(io.StringIO()) as complaint:
+                return hdf5_child.main(arguments), complaint.getvalue().strip()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    monkeypatch.setattr(hdf5_child, "limit_resources", lambda max_bytes: None)
+    monkeypatch.setattr(hdf5, "run_child", run_child)
+    with pytest.raises(ArchiveError, match=r"d\.hdf5: .* could not be put into memory \(File too large\); .*ulimit"):
+        hdf5.read(path)
 
 
 def test_memory_and_time_are_limited() -> None:

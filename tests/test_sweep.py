@@ -75,7 +75,7 @@ def test_points_that_would_share_a_folder_are_refused(tmp_path: Path) -> None:
         save_demonstrations(file, swimmer_demonstrations(seed))
     grid = {"demos": [str(file) for file in files]}
     spec = {"env": "Swimmer", "method": "gail", "fixed": {"preset": "tiny"}, "grid": grid}
-    with pytest.raises(UsageError, match="grid: two points would share the folder demos=.*a_b.npz; rename"):
+    with pytest.raises(UsageError, match=r"grid: two points would share the folder demos=.*a_b\.npz; rename"):
         sweep.variants_of(tmp_path / "s.json", spec, tmp_path)
 
 
@@ -107,6 +107,7 @@ def test_variants_share_what_they_read(tmp_path: Path) -> None:
         ("s.toml", "a = = 1", "not TOML (Invalid value (at line 1"),
         ("s.json", "{", "not JSON (Expecting property name"),
         ("s.json", "[]", "give a table with env, method"),
+        ("s.json", "[" * 100_000, "nested too deeply"),
     ],
 )
 def test_a_damaged_spec_is_one_line(
@@ -123,6 +124,19 @@ def test_toml_and_json_are_the_same(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text('env = "Swimmer"\nmethod = "expert"\n[grid]\ngamma = [0.9, 1]\n')
     (tmp_path / "s.json").write_text('{"env": "Swimmer", "method": "expert", "grid": {"gamma": [0.9, 1]}}')
     assert sweep.read_spec(tmp_path / "s.toml") == sweep.read_spec(tmp_path / "s.json")
+
+
+def test_a_byte_order_mark_does_not_matter_and_other_encodings_are_named(tmp_path: Path) -> None:
+    texts = {
+        "s.toml": 'env = "Swimmer"\n[grid]\ngamma = [0.9, 1]\n',
+        "s.json": '{"env": "Swimmer", "grid": {"gamma": [0.9, 1]}}',
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+        assert sweep.read_spec(tmp_path / name) == {"env": "Swimmer", "fixed": {}, "grid": {"gamma": [0.9, 1]}}
+        (tmp_path / name).write_text(text, encoding="utf-16")
+        with pytest.raises(UsageError, match=rf"SPEC .*{name}: not text in UTF-8; save it with that encoding"):
+            sweep.read_spec(tmp_path / name)
 
 
 def test_static_fields_make_programs_and_traced_fields_share_them(tmp_path: Path) -> None:
