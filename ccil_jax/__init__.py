@@ -35,14 +35,14 @@ __all__ = [
     "train_runs",
 ]
 
-# Python looks for a package in the folder of the script or in the current one first, where many projects have an `envs`.
+# Python looks for a package beside the script or in the current folder first, where many projects have an `envs`.
 _spec = importlib.util.find_spec("envs")
 _found = _spec and (_spec.origin or next(iter(_spec.submodule_search_locations or []), None))
 _needed = Path(__file__).resolve().parent.parent / "envs" / "__init__.py"
 if Path(str(_found)).resolve() != _needed:
     raise ImportError(
-        f"ccil_jax needs the package {_needed.parent}, but Python finds {_found} under the name envs; rename that, or run "
-        "from another folder (the command `ccil` starts the launchers from any)"
+        f"ccil_jax needs the package {_needed.parent}, but Python finds {_found} under the name envs; rename that, or "
+        "run from another folder (the command `ccil` starts the launchers from any)"
     )
 
 _HOMES = {

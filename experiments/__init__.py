@@ -12,6 +12,6 @@ _found = _spec and (_spec.origin or next(iter(_spec.submodule_search_locations o
 _needed = Path(__file__).resolve().parent.parent / "ccil_jax" / "__init__.py"
 if Path(str(_found)).resolve() != _needed:
     raise ImportError(
-        f"the launchers need the package {_needed.parent}, but Python finds {_found} under the name ccil_jax; start them "
-        "by the command `ccil`, or from another folder"
+        f"the launchers need the package {_needed.parent}, but Python finds {_found} under the name ccil_jax; start "
+        "them by the command `ccil`, or from another folder"
     )

@@ -182,6 +182,14 @@ def _is_left_over(path: Path) -> bool:
     return path.name.startswith(".") or (path.name == "checkpoints" and path.is_dir())
 
 
+def check_new_file(path: Path, option: str, *, overwrite: bool) -> None:
+    """Raises `UsageError` that names `option` where the file `path` would replace another, or a folder."""
+    if path.is_dir():
+        raise UsageError(f"{option} {path}: is a folder; give the name of a file")
+    if path.exists() and not overwrite:
+        raise UsageError(f"{option} {path}: exists; choose another name or add --overwrite")
+
+
 def check_writable(folder: Path, option: str) -> None:
     """Makes `folder` and writes a byte in it. Raises `UsageError` that names `option`."""
     try:

@@ -28,17 +28,9 @@ def overview() -> str:
     """What `ccil --help` prints."""
     known = launchers()
     width = max(map(len, known))
+    usages = [f"{CONSOLE} {rest}" for rest in ("NAME [options]", "NAME --help", "--version")]
     lines = [f"  {name:<{width}}  {line}" for name, line in known.items()]
-    return "\n".join(
-        [
-            f"usage: {CONSOLE} NAME [options]",
-            f"       {CONSOLE} NAME --help",
-            f"       {CONSOLE} --version",
-            "",
-            *lines,
-            "",
-        ]
-    )
+    return "\n".join(["usage: " + "\n       ".join(usages), "", *lines, ""])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
