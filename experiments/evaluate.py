@@ -82,8 +82,10 @@ def run(arguments: argparse.Namespace) -> None:
             "--simulator original: safety-gymnasium needs an environment of its own; use --export FILE and run there "
             "`python tests/golden/run_policy.py FILE`"
         )
-    described = _describe_recording(arguments, stored)
-    _check_files(arguments, path)
+    files = check_files(arguments, path)
+    described = describe_recording(arguments, stored)
+    for option, file in files:
+        command_line.check_writable(file.parent, option)
     content, reference = evaluate_run(stored, arguments, described)
     title = (
         f"{stored.config.method} on {stored.facts['task']}, {arguments.episodes} episodes per seed, "
@@ -94,8 +96,11 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"written to {path}")
 
 
-def _check_files(arguments: argparse.Namespace, path: Path) -> None:
-    """Raises `UsageError` where a file that is to be written has an unknown form, or would replace another."""
+def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Path]]:
+    """The files that are to be written, `path` among them, each with its option.
+
+    Raises `UsageError` where one has an unknown form, or would replace another.
+    """
     for file in arguments.export:
         if file.suffix not in (".npz", ".stablehlo"):
             raise UsageError(f"--export {file}: unknown kind of file; end its name with .npz or .stablehlo")
@@ -111,12 +116,14 @@ def _check_files(arguments: argparse.Namespace, path: Path) -> None:
             raise UsageError(f"{option} {file}: two results would go into this file; give each a name of its own")
         taken.add(file.resolve())
         command_line.check_new_file(file, option, overwrite=arguments.overwrite)
-    for option, file in [("--out", path), *written]:
-        command_line.check_writable(file.parent, option)
+    return [("--out", path), *written]
 
 
-def _describe_recording(arguments: argparse.Namespace, stored: Run) -> dict[str, Any] | None:
-    """Metadata of the demonstrations, `seed_index` among them; None where none are to be recorded."""
+def describe_recording(arguments: argparse.Namespace, stored: Run) -> dict[str, Any] | None:
+    """Metadata of the demonstrations, `seed_index` among them; None where none are to be recorded.
+
+    Raises `UsageError` where it cannot be said what to record.
+    """
     if arguments.record is None:
         for option, value in (("seed-index", arguments.seed_index), ("num-trajectories", arguments.num_trajectories)):
             if value is not None:
