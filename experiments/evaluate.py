@@ -1,4 +1,9 @@
-"""Evaluates every seed of a trained run: return and cost over fresh episodes, in our simulator or the original one."""
+"""Evaluates every seed of a trained run: return and cost over fresh episodes, in our simulator or the original one.
+
+The result file keeps earlier evaluations: the newest in each simulator stands first, those before it under `earlier`.
+With --record, one seed's policy is recorded as demonstrations too, as `expert` does; with --export, all seeds' policies
+are written for other programs.
+"""
 
 import argparse
 import sys
