@@ -9,6 +9,8 @@ Names are imported on first use (PEP 562): importing the package imports no JAX.
 """
 
 import importlib
+import importlib.util
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -32,6 +34,16 @@ __all__ = [
     "train",
     "train_runs",
 ]
+
+# Python looks for a package beside the script or in the current folder first, where many projects have an `envs`.
+_spec = importlib.util.find_spec("envs")
+_found = _spec and (_spec.origin or next(iter(_spec.submodule_search_locations or []), None))
+_needed = Path(__file__).resolve().parent.parent / "envs" / "__init__.py"
+if Path(str(_found)).resolve() != _needed:
+    raise ImportError(
+        f"ccil_jax needs the package {_needed.parent}, but Python finds {_found} under the name envs; rename that, or "
+        "run from another folder (the command `ccil` starts the launchers from any)"
+    )
 
 _HOMES = {
     "Config": "ccil_jax.config",

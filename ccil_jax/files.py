@@ -19,15 +19,15 @@ class LockedError(ConfigError):
 
 
 @contextlib.contextmanager
-def hold(path: Path) -> Iterator[None]:
-    """Holds the lock file `path`, which stays behind, unlocked. Raises `LockedError` at once if it is held.
+def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
+    """Holds the lock file `path`, which stays behind, unlocked. If it is held, raises `LockedError` at once, or waits.
 
     The operating system frees the lock when the process ends, however it ends.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             file.seek(0)
             holder = file.read().strip() or "another process"

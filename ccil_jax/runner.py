@@ -13,7 +13,7 @@ import numpy as np
 from ccil_jax import files, guard, iq_learn
 from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import Config, ConfigError, field_names, validate, with_limit_of
-from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.demonstrations import Demonstrations, check_time_limit
 from ccil_jax.digests import CheckpointError, Identity, identity_of
 from ccil_jax.guard import GuardedState
 from ccil_jax.program import Program, compile_program, make_agent
@@ -70,7 +70,12 @@ class Loaded:
 
 
 def resolve(config: Config, env: Environment, demonstrations: Demonstrations | None) -> Config:
-    """Checks that the pieces fit and sets the cost limit. Raises `ConfigError` before anything is compiled."""
+    """Checks that the pieces fit and sets the cost limit, before anything is compiled.
+
+    Raises:
+        ConfigError: options, environment and demonstrations do not fit together.
+        DemonstrationsError: an episode of the demonstrations is longer than the environment's.
+    """
     validate(config)
     if config.row.imitates:
         if demonstrations is None:
@@ -81,6 +86,7 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         ):
             if array.shape[1] != size:
                 raise ConfigError(f"demonstrations: {name} has {array.shape[1]} columns but {env.name} has {size}")
+        check_time_limit(demonstrations, "demonstrations", env.max_episode_steps)
     if demonstrations is not None:
         config = with_limit_of(config, demonstrations.mean_episode_cost)
     if (
@@ -165,6 +171,7 @@ def train(
     Raises:
         ConfigError: options, environment and demonstrations do not fit together; or the checkpoints are damaged, those
             of another training, in use by another process, or cannot be written.
+        DemonstrationsError: an episode of the demonstrations is longer than the environment's.
     """
     return train_runs(
         [config],

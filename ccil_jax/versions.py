@@ -1,14 +1,16 @@
-"""Versions of Python and of the packages that a result depends on."""
+"""Versions of Python, of this package and of those that a result depends on."""
 
 import importlib.metadata
 import platform
+
+from ccil_jax import __version__
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
 
 
 def versions() -> dict[str, str]:
-    """Version of each package that is installed, by name."""
-    found = {"python": platform.python_version()}
+    """Version of Python, of this package and of each other one that is installed, by name."""
+    found = {"python": platform.python_version(), "ccil_jax": __version__}
     for name in _PACKAGES:
         try:
             found[name] = importlib.metadata.version(name)

@@ -117,7 +117,7 @@ def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]
 
 def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
     """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
-    command = [sys.executable, "-m", f"experiments.{launcher}", *options, "--row", json.dumps(setting)]
+    command = [sys.executable, "-P", "-m", f"experiments.{launcher}", *options, "--row", json.dumps(setting)]
     # The compilation is measured, so nothing may come from a cache.
     environment = {**os.environ, "PYTHONPATH": workers.python_path(), "JAX_ENABLE_COMPILATION_CACHE": "false"}
     if setting.get("turns"):  # an accelerator's memory is shared

@@ -6,7 +6,9 @@ Nothing here imports JAX, so help and wrong input are answered at once.
 import argparse
 import datetime
 import difflib
+import itertools
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -18,6 +20,7 @@ from ccil_jax.demonstrations import DemonstrationsError
 from ccil_jax.files import DISK_IS_FULL
 from experiments import devices
 
+CONSOLE = "ccil"  # the command that an installation brings along; `experiments.console` carries it out
 MAX_ERROR = 1000  # characters of an error message, which may quote a file
 
 
@@ -30,8 +33,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, name: str, description: str) -> None:
         super().__init__(
-            prog=f"python -m experiments.{name}",
-            usage=f"python -m experiments.{name} [options]",
+            prog=launcher_command(name),
+            usage=f"{launcher_command(name)} [options]",
             description=description,
             allow_abbrev=False,  # an abbreviation would change its meaning when options are added
             formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -50,10 +53,15 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Ends the program with exit status 2 and one line on stderr."""
-        line = " ".join(message.split()).removeprefix("argument ")
-        line = "".join(c if c.isprintable() else "?" for c in line)  # text from a file may not steer the terminal
-        line = line if len(line) <= MAX_ERROR else f"{line[:MAX_ERROR]}..."
-        self.exit(2, f"{self.prog}: error: {line}\n")
+        self.exit(2, error_line(self.prog, message.removeprefix("argument ")))
+
+
+def error_line(program: str, message: str) -> str:
+    """The line on stderr by which `program` says what is wrong."""
+    line = " ".join(message.split())
+    line = "".join(c if c.isprintable() else "?" for c in line)  # text from a file may not steer the terminal
+    line = line if len(line) <= MAX_ERROR else f"{line[:MAX_ERROR]}..."
+    return f"{program}: error: {line}\n"
 
 
 def _hyphenated(token: str) -> str:
@@ -79,10 +87,22 @@ def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None]
 
 
 def command() -> str:
-    """The command line of this process, as a person would type it."""
+    """The command line of this process, quoted so that a shell repeats it."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
-    program = f"python -m {spec.name}" if spec else Path(sys.argv[0]).name
-    return " ".join([program, *sys.argv[1:]])
+    if spec:
+        return shlex.join(["python", "-m", spec.name, *sys.argv[1:]])
+    if _is_console():
+        return shlex.join([CONSOLE, *sys.argv[1:]])
+    return shlex.join(["python", *sys.orig_argv[1:]])  # a script, with its folder, or the code after `-c`
+
+
+def launcher_command(name: str) -> str:
+    """What a person types to start the launcher `name`, in the way in which this process was started."""
+    return f"{CONSOLE} {name}" if _is_console() else f"python -m experiments.{name}"
+
+
+def _is_console() -> bool:
+    return Path(sys.argv[0]).name == CONSOLE
 
 
 def integer(text: str) -> int:
@@ -114,10 +134,26 @@ def boolean(text: str) -> bool:
     return text.lower() in ("true", "yes", "1")
 
 
-def default_folder(task: str, method: str) -> Path:
-    """`runs/<task>_<method>_<timestamp>`."""
+def default_folder(task: str, method: str, option: str = "--out") -> Path:
+    """Makes `runs/<task>_<method>_<timestamp>`, with `-02` and so on after it where another run has that name.
+
+    Making the folder is what keeps two runs apart that begin in the same second. So call it when everything else has
+    been checked. Raises `UsageError` that names `option` if it cannot be made.
+    """
     stamp = datetime.datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / f"{task}_{method}_{stamp}"
+    first = folder = Path("runs") / f"{task}_{method}_{stamp}"
+    numbers = itertools.count(2)
+    try:
+        first.parent.mkdir(exist_ok=True)
+        while True:
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                folder = first.with_name(f"{first.name}-{next(numbers):02d}")
+            else:
+                return folder
+    except OSError as error:
+        raise _cannot_write(folder, option, error) from None
 
 
 def check_output_folder(
@@ -146,6 +182,14 @@ def _is_left_over(path: Path) -> bool:
     return path.name.startswith(".") or (path.name == "checkpoints" and path.is_dir())
 
 
+def check_new_file(path: Path, option: str, *, overwrite: bool) -> None:
+    """Raises `UsageError` that names `option` where the file `path` would replace another, or a folder."""
+    if path.is_dir():
+        raise UsageError(f"{option} {path}: is a folder; give the name of a file")
+    if path.exists() and not overwrite:
+        raise UsageError(f"{option} {path}: exists; choose another name or add --overwrite")
+
+
 def check_writable(folder: Path, option: str) -> None:
     """Makes `folder` and writes a byte in it. Raises `UsageError` that names `option`."""
     try:
@@ -153,5 +197,9 @@ def check_writable(folder: Path, option: str) -> None:
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(b"x")
     except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        raise UsageError(f"{option} {folder}: cannot be written ({reason}); choose another folder") from None
+        raise _cannot_write(folder, option, error) from None
+
+
+def _cannot_write(folder: Path, option: str, error: OSError) -> UsageError:
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    return UsageError(f"{option} {folder}: cannot be written ({reason}); choose another folder")

@@ -71,16 +71,17 @@ def _ask_xla(name: str, value: str) -> None:
 def keep_programs() -> None:
     """Has JAX keep compiled programs in the user's cache folder, so that the second start of one compiles nothing.
 
-    JAX's own variables have precedence: JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE=false.
+    JAX's own variables have precedence: JAX_COMPILATION_CACHE_DIR, JAX_ENABLE_COMPILATION_CACHE=false. Without a home
+    folder, or where it cannot be written, there is no cache: every start compiles, which is slower and not wrong.
     """
-    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(caches) / "ccil_jax" / "programs" / _processor()
     if "JAX_COMPILATION_CACHE_DIR" in os.environ:
         return
     try:
+        caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(caches) / "ccil_jax" / "programs" / _processor()
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return  # slower, not wrong
+    except (OSError, RuntimeError):  # `Path.home` raises RuntimeError for a user whom the system does not know
+        return
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(_CACHE_BYTES))
 

@@ -7,18 +7,18 @@ the preset `expert`, those of Safety Gym tasks from `safety_gym_expert`.
 """
 
 import argparse
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.demonstrations import Demonstrations, save_demonstrations
-from ccil_jax.versions import versions
+from ccil_jax.demonstrations import save_demonstrations
 from experiments import command_line, options, run_folder
 from experiments.command_line import Parser, UsageError
+from experiments.recording import choose_seed, facts, print_demonstrations, record
 from experiments.resuming import resumed
-from experiments.summary import number, show, with_error
-from experiments.training import Outcome, Plan, execute
+from experiments.training import Plan, execute
 
 PRESETS = {"locomotion": "expert", "safety_gym": "safety_gym_expert"}  # of each family
 DEFAULTS = {**options.DEFAULTS, "preset": PRESETS["locomotion"]}
@@ -69,15 +69,16 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
     limit = {} if arguments.unconstrained or "cost_limit" in choices else {"cost_limit": task.cost_limit}
     preset = {**saved, **given}.get("preset", PRESETS[task.family])
     config = options.config_from({**given, **limit}, preset, saved)
-    folder = arguments.run_dir or command_line.default_folder(task.name, method)
+    env_options = options.env_options(choices, task)
     command_line.check_writable(arguments.out.parent, "--out")
+    folder = arguments.run_dir or command_line.default_folder(task.name, method, "--run-dir")
     command_line.check_output_folder(folder, resume=arguments.resume, option="--run-dir")
     return Plan(
         config=config,
         preset=preset,
         task=task.name,
         physics=choices["physics"],
-        env_options=options.env_options(choices, task),
+        env_options=env_options,
         demonstrations=None,
         demonstrations_path=None,
         num_seeds=choices["num_seeds"],
@@ -100,83 +101,31 @@ def _resumed(folder: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:
     return saved
 
 
-def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int | None:
-    """The seed with the highest return among those within the limit; None if there is none."""
-    allowed = [row for row in rows if cost_limit is None or row["episode_cost"] <= cost_limit]
-    return max(allowed, key=lambda row: row["episode_return"])["seed"] if allowed else None
-
-
-def record(outcome: Outcome, seed: int, num_trajectories: int) -> Demonstrations:
-    """Rolls out the chosen seed's policy and adds what a reader of the file needs to know."""
-    import jax
-
-    from ccil_jax import evaluation
-
-    plan = outcome.plan
-    actor = jax.tree.map(lambda leaf: leaf[seed], outcome.result.agent)
-    row = outcome.summary["per_seed"][seed]
-    facts = {
-        "task": plan.task,
-        "method": plan.config.method,
-        "cost_limit": plan.config.cost_limit,
-        **plan.env_options,
-        "physics": outcome.env.physics_name,
-        "env_steps": outcome.result.env_steps,
-        "seed": plan.seed,
-        "seed_index": seed,
-        "evaluation": {k: row[k] for k in ("episode_return", "episode_cost", "episode_length")},
-        "random_policy": {k: outcome.summary[f"random_{k}"] for k in ("return", "cost")},
-        "command": plan.command,
-        "versions": versions(),
-        "git_commit": run_folder.git_commit(),
-    }
-    return evaluation.record(
-        outcome.result.config,
-        actor,
-        outcome.env,
-        num_episodes=num_trajectories,
-        seed=plan.evaluation_seed + 1,
-        metadata=facts,
-    )
-
-
-def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
-    """One table: each recorded trajectory's length, return and cost, and their means beside the limit."""
-    from rich.table import Table
-
-    returns = demonstrations.episode_returns
-    table = Table(title="recorded demonstrations", title_justify="left")
-    for heading in ("", "return", "cost", "steps"):
-        table.add_column(heading, justify="right" if heading else "left")
-    costs, lengths = demonstrations.episode_costs, demonstrations.episode_lengths
-    for i, (cost, length) in enumerate(zip(costs, lengths, strict=True)):
-        table.add_row(f"trajectory {i}", number(None if returns is None else returns[i]), number(cost), str(length))
-    table.add_section()
-    mean_return = with_error(demonstrations.mean_episode_return, demonstrations.return_standard_error)
-    mean_cost = with_error(demonstrations.mean_episode_cost, demonstrations.cost_standard_error)
-    table.add_row("mean +- standard error", mean_return, mean_cost, number(demonstrations.mean_episode_length))
-    random = demonstrations.metadata["random_policy"]
-    table.add_row("random policy", number(random["return"]), number(random["cost"]), "")
-    if demonstrations.metadata["cost_limit"] is not None:
-        table.add_row("limit", "", number(demonstrations.metadata["cost_limit"]), "")
-    show(table)
-    print(f"demonstrations  {path}")
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Trains, chooses, records; status 1 where no seed keeps the limit."""
     plan = make_plan(arguments)
     outcome = execute(plan)
     seed = choose_seed(outcome.summary["per_seed"], plan.config.prescribed_limit)
     if seed is None:
-        lowest = min(row["episode_cost"] for row in outcome.summary["per_seed"])
+        lowest = min(outcome.summary["per_seed"], key=lambda row: row["episode_cost"])
+        remedy = [str(plan.folder), "--record", str(arguments.out), "--seed-index", str(lowest["seed"])]
+        remedy += ["--num-trajectories", str(arguments.num_trajectories)]
         print(
-            f"no seed keeps --cost-limit {plan.config.cost_limit:g} (lowest cost {lowest:g}): nothing was recorded; "
-            "train longer (--env-steps), use more seeds or a higher limit",
+            f"no seed keeps --cost-limit {plan.config.cost_limit:g} (lowest cost {lowest['episode_cost']:g}): nothing "
+            "was recorded; train longer (--env-steps), use more seeds or a higher limit, or record that policy all the "
+            f"same: {command_line.launcher_command('evaluate')} {shlex.join(remedy)}",
             file=sys.stderr,
         )
         return 1
-    demonstrations = record(outcome, seed, arguments.num_trajectories)
+    trained = run_folder.read_run(plan.folder)
+    demonstrations = record(
+        outcome.result.config,
+        outcome.result.agent,
+        outcome.env,
+        num_trajectories=arguments.num_trajectories,
+        episode_seed=(plan.evaluation_seed + 1) % 2**32,
+        facts=facts(trained, outcome.summary, seed, trained.facts["command"]),
+    )
     save_demonstrations(arguments.out, demonstrations)
     print_demonstrations(demonstrations, arguments.out)
     return 0

@@ -1,5 +1,8 @@
 """SIGTERM, SIGINT and SIGUSR1: a training saves and leaves, anything else leaves at once; status 128 + signal.
 
+A signal that was ignored when the process began stays ignored: `nohup` and shells that start background jobs do this so
+that a Ctrl-C meant for another program does not end the job.
+
 Python runs its handlers between two bytecodes of the main thread, which compiles for minutes inside XLA. So a thread
 of its own hears of a signal, through the pipe that Python's C handler writes to.
 """
@@ -29,7 +32,7 @@ class Interruption:
             self._ears, mouth = os.pipe()
             os.set_blocking(mouth, False)
             self._mouth = mouth
-            self._handlers = {number: signal.signal(number, lambda *_: None) for number in SIGNALS}
+            self._handlers = {number: signal.signal(number, lambda *_: None) for number in SIGNALS if _is_heard(number)}
             self._descriptor = signal.set_wakeup_fd(mouth, warn_on_full_buffer=False)
             self._thread = threading.Thread(target=self._listen, daemon=True)
             self._thread.start()
@@ -74,6 +77,11 @@ class Interruption:
                 self._requested = signal.Signals(number)
 
 
+def _is_heard(number: signal.Signals) -> bool:
+    """Whether a signal has an effect; None stands for a handler of C code, which Python could not put back."""
+    return signal.getsignal(number) not in (signal.SIG_IGN, None)
+
+
 def _farewell(number: signal.Signals, state: str) -> str:
     return f"{number.name}: {state}"
 
@@ -87,7 +95,12 @@ def _leave(number: signal.Signals) -> NoReturn:
 
 
 def stop_at_eof() -> None:
-    """SIGTERM for this process as soon as its standard input ends: whoever waits for it, holding that open, is gone."""
+    """SIGTERM for this process as soon as its standard input ends: whoever waits for it, holding that open, is gone.
+
+    SIGTERM is also how whoever waits stops this process. So it is heard even where it was ignored when that one began.
+    """
+    if not _is_heard(signal.SIGTERM):
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 1):  # not through its buffer, whose lock Python wants when it ends

@@ -111,6 +111,7 @@ def evaluate(
     num_episodes: int,
     seed: int = 0,
     deterministic: bool = False,
+    shared_episodes: bool = False,
     contact_cost: bool = True,
 ) -> Totals:
     """As `ccil_jax.evaluation.evaluate`, in gymnasium's simulator. `actor` is [num_seeds]-leading.
@@ -119,9 +120,11 @@ def evaluate(
     """
     simulator, learnt, results = make_simulator(env), policies(config, actor, env), []
     for index, policy in enumerate(learnt):
-        random = np.random.default_rng([seed, index])
+        draw = 0 if shared_episodes else index
+        random = np.random.default_rng([seed, draw])
         for episode in range(num_episodes):
-            steps = run_episode(simulator, policy, random, (seed + episode) % 2**32, deterministic)
+            (start,) = np.random.SeedSequence([seed, draw, episode]).generate_state(1)
+            steps = run_episode(simulator, policy, random, int(start), deterministic)
             results.append(score(env, steps, contact_cost))
     simulator.close()
     totals = np.array(results).reshape(len(learnt), num_episodes, 3)

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import dataclasses
+import importlib.metadata
 import json
 import math
 import os
@@ -17,7 +18,7 @@ import numpy as np
 
 from ccil_jax.config import Config
 from ccil_jax.versions import versions
-from experiments.command_line import UsageError
+from experiments.command_line import UsageError, command
 from experiments.statistics import known_mean
 
 METRICS = (  # order of the columns; a method leaves out those that it lacks
@@ -120,7 +121,11 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
 
 
 def git_commit() -> str | None:
-    """Commit of the source tree, with `-dirty` after it where files differ; None outside a checkout."""
+    """Commit of the sources, with `-dirty` after it where files of the checkout differ; None where it is not known."""
+    return _checkout_commit() or _installed_commit()
+
+
+def _checkout_commit() -> str | None:
     try:
         if _git("rev-parse", "--show-prefix") != f"{Path(__file__).parent.name}/":
             return None  # installed inside somebody else's checkout
@@ -131,10 +136,28 @@ def git_commit() -> str | None:
     return head + ("-dirty" if changed else "")
 
 
+def _installed_commit() -> str | None:
+    """The commit that `pip install git+URL` built this installation from (PEP 610); None for any other."""
+    try:
+        installed = importlib.metadata.distribution("ccil_jax")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    if Path(str(installed.locate_file("experiments"))).resolve() != Path(__file__).resolve().parent:
+        return None  # these sources are others than the installed ones
+    origin = json.loads(installed.read_text("direct_url.json") or "{}")
+    commit = origin.get("vcs_info", {}).get("commit_id")
+    return str(commit) if commit else None
+
+
 def _git(*arguments: str) -> str:
     command = ["git", *arguments]
     folder = Path(__file__).parent
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+
+
+def provenance() -> dict[str, Any]:
+    """What made a result: the command line of this process, the versions and the commit."""
+    return {"command": command(), "versions": versions(), "git_commit": git_commit()}
 
 
 def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:

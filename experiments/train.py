@@ -136,7 +136,7 @@ def _shipped(task: str) -> Path:
         names = ", ".join(sorted(p.stem for p in folder.glob("*.npz"))) or "none"
         raise UsageError(
             f"--demos: no demonstrations are shipped for {task} (shipped: {names}); "
-            f"record some with `python -m experiments.expert --env {task}` and give the file"
+            f"record some with `{command_line.launcher_command('expert')} --env {task}` and give the file"
         )
     return path
 

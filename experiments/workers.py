@@ -90,7 +90,7 @@ def run_worker(
     `variables` are of its environment.
     """
     stopping = stopping or threading.Event()
-    command = [sys.executable, "-m", "experiments.sweep_worker", str(folder), "--until-eof"]
+    command = [sys.executable, "-P", "-m", "experiments.sweep_worker", str(folder), "--until-eof"]
     command += ["--cpus", ",".join(map(str, cpus))] if cpus else []
     log, status = folder / "worker.log", 0
     for _ in range(_TRIES):

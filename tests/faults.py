@@ -313,6 +313,9 @@ def child(launcher: str, arguments: Sequence[str]) -> int:
     from ccil_jax import runner
 
     runner.CHECKPOINT_SECONDS, runner.SAVING_SHARE, runner.CHUNK_SECONDS = 0.3, 1.0, 0.0
+    for number in (signal.SIGTERM, signal.SIGUSR1):  # sent here, even if whoever runs this began with them ignored
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     return importlib.import_module(f"experiments.{launcher}").main(arguments)
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -99,7 +100,8 @@ def module_of(name: str) -> str:
 
 
 def own_imports(name: str) -> set[str]:
-    found = {module_of(imported) for imported in imports(TREES[name])}
+    constants = {"ccil_jax.__version__"}  # of a package whose other names stand for modules
+    found = {module_of(imported) for imported in imports(TREES[name]) if imported not in constants}
     return {module for module in found if module.partition(".")[0] in (*PACKAGES, "tests")}
 
 
@@ -252,3 +254,13 @@ def test_the_version_is_that_of_the_package() -> None:
     if "ccil_jax" not in {distribution.metadata["Name"] for distribution in importlib.metadata.distributions()}:
         pytest.skip("not installed")
     assert ccil_jax.__version__ == importlib.metadata.version("ccil_jax")
+
+
+def test_one_place_says_the_version() -> None:
+    """The build reads it from the package."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "version" not in settings["project"]
+    assert settings["project"]["dynamic"] == ["version"]
+    place = ROOT / settings["tool"]["hatch"]["version"]["path"]
+    assert place == SOURCES["ccil_jax"]
+    assert len(re.findall(r'^__version__ = "\d+\.\d+\.\d+"$', place.read_text(encoding="utf-8"), re.MULTILINE)) == 1

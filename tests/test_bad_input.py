@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccil_jax.config import Config
 from ccil_jax.demonstrations import Demonstrations, save_demonstrations
 
 PROBE = """
@@ -80,6 +81,7 @@ FILES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 TRAIN = ("train", "--method", "malm", "--env", "Swimmer", "--demos", "good.npz", "--out", "run")
 EXPERT = ("expert", "--env", "Swimmer", "--out", "expert.npz", "--run-dir", "run")
+RECORD = ("evaluate", "done", "--record", "new.npz")
 OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "no method": (("train", "--env", "Swimmer"), "--method: required"),
     "no task": (("train", "--method", "malm"), "--env: required"),
@@ -110,6 +112,10 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "limit missing": ((*TRAIN, "--method", "lgail"), "--cost-limit"),
     "negative threshold": ((*TRAIN, "--cost-threshold=-1"), "--cost-threshold -1.0: must be finite and not negative"),
     "too many trajectories": ((*TRAIN, "--num-demos", "3"), "--num-demos 3: good.npz holds 2"),
+    "too many trajectories for a folder": (
+        ("train", "--method", "malm", "--env", "Swimmer", "--num-demos", "99"),
+        "--num-demos 99: ",
+    ),
     "nothing shipped": (
         ("train", "--method", "malm", "--env", "Humanoid"),
         "no demonstrations are shipped for Humanoid",
@@ -136,6 +142,36 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "evaluate something else": (("evaluate", "full"), "full/config.json: cannot be read"),
     "evaluate in another world": (("evaluate", "old", "--simulator", "bullet"), "--simulator: invalid choice"),
     "evaluate no episode": (("evaluate", "old", "--episodes", "0"), "--episodes: 0: must be at least 1"),
+    "evaluate into notes": (
+        ("evaluate", "done", "--out", "full/notes.txt"),
+        "--out full/notes.txt: exists, and is not an intact file of evaluations; move it away",
+    ),
+    "evaluate into a run": (("evaluate", "done", "--out", "done/config.json"), "--out done/config.json: exists, and"),
+    "export over a file": (("evaluate", "done", "--export", "good.npz"), "--export good.npz: exists; choose another"),
+    "record over a file": (("evaluate", "done", "--record", "good.npz"), "--record good.npz: exists; choose another"),
+    "record over a folder": (
+        ("evaluate", "done", "--record", "old.npz", "--overwrite"),
+        "--record old.npz: is a folder",
+    ),
+    "record to other format": (
+        ("evaluate", "done", "--record", "new.h5"),
+        "--record new.h5: a demonstrations file is named *.npz",
+    ),
+    "record twice": (
+        (*RECORD, "--export", "./new.npz", "--seed-index", "0"),
+        "--record new.npz: two results would go into this file",
+    ),
+    "record no such seed": ((*RECORD, "--seed-index", "2"), "--seed-index 2: the run has 2 seed(s); give 0 to 1"),
+    "record without a seed": (
+        RECORD,
+        "--record: no seed keeps the cost limit 20 (seed 0: 21, seed 1: 30.5); choose one by --seed-index N",
+    ),
+    "record what": (("evaluate", "done", "--seed-index", "1"), "--seed-index 1: says what to record; add --record"),
+    "record how many": (("evaluate", "done", "--num-trajectories", "3"), "--num-trajectories 3: says what to record"),
+    "record the mode": ((*RECORD, "--deterministic"), "--deterministic: demonstrations are recorded from sampled"),
+    "record elsewhere": ((*RECORD, "--simulator", "original"), "--simulator original: demonstrations are recorded in"),
+    "record too early": (("evaluate", "half", "--record", "new.npz"), "the run in half is not finished; continue it"),
+    "overwrite nothing": (("evaluate", "done", "--overwrite"), "--overwrite: for files of --export and --record"),
     "report on nothing": (("report", "none"), "RUN_DIR none: no such folder"),
     "report on something else": (("report", "full"), "full/config.json: cannot be read"),
     "benchmark of what": (("benchmark", "--tasks", "Swimer"), "--tasks Swimer: unknown task; did you mean Swimmer?"),
@@ -159,10 +195,30 @@ def assert_one_line(done: subprocess.CompletedProcess[str], launcher: str, messa
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A working directory with good demonstrations, an old run and a folder of something else."""
+    """A working directory with good demonstrations, runs (old, finished, unfinished) and a folder of something else."""
     save_demonstrations(tmp_path / "good.npz", demonstrations())
-    for name, content in (("old/config.json", "{}"), ("full/notes.txt", "mine")):
-        (tmp_path / name).parent.mkdir()
+    (tmp_path / "old.npz").mkdir()
+    rows = [
+        {"seed": i, "episode_return": 1.0, "episode_cost": cost, "episode_length": 5.0}
+        for i, cost in enumerate([21, 30.5])
+    ]
+    config = Config(method="expert", cost_limit=20.0)
+    facts = {"task": "Swimmer", "num_seeds": 2, "seed": 0, "physics": "native", "preset": "expert", "eval_episodes": 2}
+    facts |= {"demonstrations": None, "command": "", "env_options": {}, "config": dataclasses.asdict(config)}
+    facts |= {f"expert_{name}": None for name in ("return", "cost", "length")}
+    summary = {"per_seed": rows, "random_return": 0.0, "random_cost": 0.0}
+    steps = config.num_iterations * config.steps_per_iteration
+    for name, content in (
+        ("old/config.json", "{}"),
+        ("full/notes.txt", "mine"),
+        ("done/config.json", json.dumps(facts)),
+        ("done/summary.json", json.dumps({**summary, "env_steps": steps})),
+        ("done/checkpoints/1/data", ""),
+        ("half/config.json", json.dumps(facts)),
+        ("half/summary.json", json.dumps({**summary, "env_steps": steps - 1})),  # of before it was continued
+        ("half/checkpoints/1/data", ""),
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(content)
     return tmp_path
 
@@ -181,6 +237,8 @@ def test_bad_demonstrations(folder: Path, case: str) -> None:
 def test_bad_options(folder: Path, case: str) -> None:
     arguments, message = OPTIONS[case]
     assert_one_line(launch(*arguments, cwd=folder), arguments[0], message)
+    assert not (folder / "runs").exists()  # where runs go that are not told where
+    assert not (folder / "new.npz").exists()
 
 
 @pytest.mark.parametrize("launcher", ["train", "expert", "evaluate", "report", "benchmark", "ablations"])

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccil_jax.config import PRESETS, Config
+import ccil_jax
+from ccil_jax.config import PRESCRIBED_LIMIT_METHODS, PRESETS, Config
 from ccil_jax.demonstrations import load_demonstrations
 from ccil_jax.files import file_sha256
-from experiments import evaluate, expert, options, run_folder, train
-from experiments.command_line import Parser
+from experiments import evaluate, expert, options, recording, run_folder, train
+from experiments.command_line import Parser, UsageError, command
 from tests.probe_envs import quick_compilation
 
 TINY = ["--preset", "tiny", "--max-episode-steps", "20", "--num-seeds", "2", "--eval-episodes", "3"]
@@ -148,6 +149,71 @@ def test_evaluate_agrees_with_the_original_simulator(pipeline: Path, capsys: pyt
         assert abs(ours["episode_return"] - theirs["episode_return"]) < 3.0  # 40 episodes of an untrained policy
         assert abs(ours["episode_cost"] - theirs["episode_cost"]) < 3.0
     assert "seed 1" in capsys.readouterr().out
+
+
+def test_evaluate_records_what_expert_recorded(
+    pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same seed's policy in the same episodes."""
+    original = load_demonstrations(pipeline / "expert.npz")
+    again = [f"{pipeline}/expert", "--record", f"{tmp_path}/same.npz", "--num-trajectories", "4", "--episodes", "3"]
+    again += ["--seed", str(original.metadata["episode_seed"] - 1), "--out", f"{tmp_path}/evaluation.json"]
+    assert evaluate.main(again) == 0
+    same = load_demonstrations(tmp_path / "same.npz")
+    for field in dataclasses.fields(same):
+        if field.name != "metadata":
+            np.testing.assert_array_equal(getattr(same, field.name), getattr(original, field.name))
+    assert same.metadata["command"].splitlines() == [original.metadata["command"], command()]
+    for facts in (same.metadata, original.metadata):
+        del facts["command"]
+    assert same.metadata == original.metadata
+    assert original.metadata["limit_kept"] is True
+    assert original.metadata["versions"]["ccil_jax"] == ccil_jax.__version__
+    assert original.metadata["trained_with"]["versions"] == original.metadata["versions"]
+    assert "recorded demonstrations" in capsys.readouterr().out
+    entry = run_folder.read_json(tmp_path / "evaluation.json")["ours"]
+    assert entry["run"] == str(pipeline / "expert")
+    assert entry["versions"]["ccil_jax"] == ccil_jax.__version__
+
+
+def test_any_seed_can_be_recorded(pipeline: Path, tmp_path: Path) -> None:
+    stored = run_folder.read_run(pipeline / "malm")
+    summary = run_folder.read_json(pipeline / "malm" / "summary.json")
+    arguments = evaluate.make_parser().parse_args([f"{pipeline}/malm", "--record", "new.npz", "--seed-index", "1"])
+    facts = evaluate.describe_recording(arguments, stored)
+    assert facts
+    assert facts["seed_index"] == 1
+    assert facts["evaluation"] == {name: summary["per_seed"][1][name] for name in facts["evaluation"]}
+    assert facts["cost_limit"] == summary["expert_cost"]
+    assert facts["limit_kept"] == (facts["evaluation"]["episode_cost"] <= summary["expert_cost"])
+    assert facts["command"] == f"{stored.facts['command']}\n{command()}"
+
+
+def test_files_are_replaced_only_if_asked_for(tmp_path: Path) -> None:
+    old, out = tmp_path / "old.npz", tmp_path / "evaluation.json"
+    old.write_bytes(b"old")
+    given = [str(tmp_path), "--record", str(old), "--export", f"{tmp_path}/a.stablehlo"]
+    with pytest.raises(UsageError, match=r"--record .*old\.npz: exists; choose another name or add --overwrite"):
+        evaluate.check_files(evaluate.make_parser().parse_args(given), out)
+    files = evaluate.check_files(evaluate.make_parser().parse_args([*given, "--overwrite"]), out)
+    assert files == [("--out", out), ("--export", tmp_path / "a.stablehlo"), ("--record", old)]
+
+
+@pytest.mark.parametrize(
+    ("method", "limit"),
+    [("malm", 12.0), ("lgail", 20.0), ("expert", 20.0), ("gail", None), ("bc", None), ("trpo", None)],
+)
+def test_the_limit_is_that_of_the_method(method: str, limit: float | None) -> None:
+    config = Config(method=method, cost_limit=20.0 if method in PRESCRIBED_LIMIT_METHODS else None)
+    run: Any = SimpleNamespace(config=config, facts={"expert_cost": 12.0})
+    assert recording.cost_limit(run) == limit
+
+
+def test_methods_without_a_limit_are_those_of_the_table() -> None:
+    from ccil_jax.methods import METHODS
+
+    unlimited = {name for name, method in METHODS.items() if method.limit == "none"}
+    assert unlimited | {"bc", "iq_learn"} == recording.WITHOUT_LIMIT  # those two have no row, and no cost
 
 
 def test_exported_policies_are_the_learnt_ones(
@@ -307,8 +373,12 @@ def test_no_seed_within_the_limit_is_a_failure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows = [{"seed": 0, "episode_return": 1.0, "episode_cost": 21.0}]
+    rows = [{"seed": 0, "episode_return": 1.0, "episode_cost": 33.0}, {**rows[0], "seed": 1}]
     monkeypatch.setattr(expert, "execute", lambda plan: SimpleNamespace(summary={"per_seed": rows}))
     made = ["--env", "Swimmer", "--out", f"{tmp_path}/e.npz", "--run-dir", f"{tmp_path}/run", *TINY]
     assert expert.main([*made, "--cost-limit", "20"]) == 1
-    assert "no seed keeps --cost-limit 20 (lowest cost 21)" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "no seed keeps --cost-limit 20 (lowest cost 21)" in said
+    remedy = f"evaluate {tmp_path}/run --record {tmp_path}/e.npz --seed-index 1 --num-trajectories 10"
+    assert f"python -m experiments.{remedy}\n" in said
     assert not (tmp_path / "e.npz").exists()

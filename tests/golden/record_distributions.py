@@ -16,6 +16,7 @@ metadata [] str: JSON with versions, command, seed and the number of steps.
 
 import argparse
 import json
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ def main() -> None:
                     flush=True,
                 )
         arrays = {key: np.array([episode[key] for episode in episodes]) for key in episodes[0]}
-        command = " ".join(["python -m tests.golden.record_distributions", *sys.argv[1:]])
+        command = shlex.join(["python", "-m", "tests.golden.record_distributions", *sys.argv[1:]])
         own = {"command": command, "task": f"Safety{name}-v0", "num_steps": options.steps}
         facts: dict[str, Any] = provenance(options) | own
         np.savez_compressed(options.out / f"{name}.npz", metadata=np.array(json.dumps(facts)), **arrays)

@@ -53,6 +53,7 @@ robot; the metadata names the objects. `--tasks` without names makes this file a
 
 import argparse
 import json
+import shlex
 import sys
 import time
 import zlib
@@ -550,7 +551,7 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
     packages = ("safety-gymnasium", "mujoco", "gymnasium", "numpy")
     return {
         "versions": {"python": sys.version.split()[0]} | {package: version(package) for package in packages},
-        "command": " ".join(["python tests/golden/record_safety_gym.py", *sys.argv[1:]]),
+        "command": shlex.join(["python", "tests/golden/record_safety_gym.py", *sys.argv[1:]]),
         "seed": options.seed,
     }
 
