@@ -67,6 +67,9 @@ def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = 
     A field that none of `methods` uses is left out of `--help`; given all the same, it is refused with the reason. What
     is not given is absent from the parsed arguments.
     """
+    parser.epilog = (
+        "static: shapes the program, so that a change compiles it anew; all other numbers may vary within it"
+    )
     groups: dict[Use, Any] = {}
     defaults = Config(**PRESETS[preset])
     for field in dataclasses.fields(Config):
@@ -78,8 +81,8 @@ def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = 
         choices = f"; one of {', '.join(CHOICES[field.name])}" if field.name in CHOICES else ""
         value = getattr(defaults, field.name)
         default = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-        again = "" if field.metadata["traced"] else "; a change compiles the program anew"
-        text = f"{field.metadata['help']}{choices} (default: {default.lower()}{again})".replace("%", "%%")
+        static = "" if field.metadata["traced"] else "; static"
+        text = f"{field.metadata['help']}{choices} (default: {default.lower()}{static})".replace("%", "%%")
         groups[use].add_argument(
             "--" + field.name.replace("_", "-"),
             dest=field.name,

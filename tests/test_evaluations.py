@@ -13,11 +13,20 @@ from experiments.command_line import UsageError
 
 def evaluation(cost: float, **changes: Any) -> dict[str, Any]:
     settings = {"run": "a", "simulator": "ours", "num_episodes": 50, "seed": 1, "deterministic": False}
+    settings |= {"shared_episodes": False}
     return {**settings, **changes, "command": f"cost {cost}", "per_seed": [{"seed": 0, "episode_cost": cost}]}
 
 
 @pytest.mark.parametrize(
-    "change", [{"seed": 2}, {"num_episodes": 3}, {"deterministic": True}, {"run": "b"}, {"per_seed": []}]
+    "change",
+    [
+        {"seed": 2},
+        {"num_episodes": 3},
+        {"deterministic": True},
+        {"shared_episodes": True},
+        {"run": "b"},
+        {"per_seed": []},
+    ],
 )
 def test_what_differs_is_kept_aside(tmp_path: Path, change: dict[str, Any]) -> None:
     path = tmp_path / "evaluation.json"

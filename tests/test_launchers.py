@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -11,9 +12,10 @@ import numpy as np
 import pytest
 
 import ccil_jax
-from ccil_jax.config import PRESCRIBED_LIMIT_METHODS, PRESETS, Config
+from ccil_jax.config import PRESETS, Config
 from ccil_jax.demonstrations import load_demonstrations
 from ccil_jax.files import file_sha256
+from ccil_jax.methods import METHODS
 from experiments import evaluate, expert, options, recording, run_folder, train
 from experiments.command_line import Parser, UsageError, command
 from tests.probe_envs import quick_compilation
@@ -37,7 +39,7 @@ def test_options_are_the_fields_of_config() -> None:
     }
     assert options.config_from(given, "paper") == Config(**given)
     assert options.config_from({"batch_size": 400}, "tiny").hidden_sizes == (8, 8)
-    assert set(options.CONFIG_FIELDS) <= set(vars(parser.parse_args(_every_option())))
+    assert {*options.CONFIG_FIELDS} - {"method"} <= set(vars(parser.parse_args(_every_option())))
 
 
 @pytest.mark.parametrize(("launcher", "batch_size"), [(train, 2000), (expert, 4000)])
@@ -46,12 +48,14 @@ def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleTyp
     preset = re.search(r"hyperparameters to start from \(default: (\w+)\)", text)
     assert preset
     assert PRESETS[preset[1]].get("batch_size", Config().batch_size) == batch_size
-    assert f"K (Table 1) (default: {batch_size})" in text
+    assert f"K (Table 1) (default: {batch_size}; static)" in text
 
 
 def _every_option() -> list[str]:
     given: list[str] = []
     for field in dataclasses.fields(Config):
+        if field.name == "method":  # the launchers' own
+            continue
         value = field.default
         text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
         given += ["--" + field.name, text]
@@ -204,16 +208,9 @@ def test_files_are_replaced_only_if_asked_for(tmp_path: Path) -> None:
     [("malm", 12.0), ("lgail", 20.0), ("expert", 20.0), ("gail", None), ("bc", None), ("trpo", None)],
 )
 def test_the_limit_is_that_of_the_method(method: str, limit: float | None) -> None:
-    config = Config(method=method, cost_limit=20.0 if method in PRESCRIBED_LIMIT_METHODS else None)
+    config = Config(method=method, cost_limit=20.0 if METHODS[method].limit == "prescribed" else None)
     run: Any = SimpleNamespace(config=config, facts={"expert_cost": 12.0})
     assert recording.cost_limit(run) == limit
-
-
-def test_methods_without_a_limit_are_those_of_the_table() -> None:
-    from ccil_jax.methods import METHODS
-
-    unlimited = {name for name, method in METHODS.items() if method.limit == "none"}
-    assert unlimited | {"bc", "iq_learn"} == recording.WITHOUT_LIMIT  # those two have no row, and no cost
 
 
 def test_exported_policies_are_the_learnt_ones(
@@ -356,6 +353,41 @@ def test_resume_refuses_other_choices(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--unconstrained"], "is of method expert; leave --unconstrained out to resume it"),
+        (["--multiplier-update", "sgd"], "--multiplier-update sgd: the run in"),
+        (["--initial-multiplier", "3"], "--initial-multiplier 3.0: the run in"),
+        (["--gamma", "0.5"], "--gamma 0.5: the run in"),
+        (["--gate", "episode"], "--gate episode: makes no difference to this run of method expert"),
+    ],
+)
+def test_what_an_expert_may_not_change_when_it_goes_on(
+    pipeline: Path, tmp_path: Path, more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        expert.main(["--out", f"{tmp_path}/e.npz", "--run-dir", f"{pipeline}/expert", "--resume", *more])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_an_expert_goes_on_under_another_limit(pipeline: Path, tmp_path: Path) -> None:
+    shutil.copytree(pipeline / "expert", tmp_path / "expert")
+    made = ["--out", f"{tmp_path}/e.npz", "--run-dir", f"{tmp_path}/expert", "--resume"]
+    more = ["--cost-limit", "19", "--multiplier-learning-rate", "0.5", "--env-steps", "360"]
+    assert expert.main([*made, *more, "--num-trajectories", "2"]) == 0
+    before, after = (run_folder.read_metrics(folder / "expert") for folder in (pipeline, tmp_path))
+    assert len(before["env_steps"]) < len(after["env_steps"])
+    for name, rows in before.items():
+        np.testing.assert_array_equal(after[name][: len(rows)], rows)
+    config = run_folder.read_run(tmp_path / "expert").config
+    assert (config.cost_limit, config.multiplier_learning_rate) == (19.0, 0.5)
+    facts = load_demonstrations(tmp_path / "e.npz").metadata
+    assert (facts["cost_limit"], facts["limit_kept"]) == (19.0, True)
+    assert len(facts["command"].splitlines()) == 2
 
 
 def test_resume_refuses_other_demonstrations(

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,12 @@ import numpy as np
 import pytest
 
 import envs
-from ccil_jax import runner
+from ccil_jax import agents, runner
 from ccil_jax.config import Config, ConfigError
 from ccil_jax.program import compile_program
 from ccil_jax.runner import Result
 from experiments import devices
-from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Counter, Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 NUM_SEEDS = 2
 CHOICES = ((1.0, 0.02, 0.5), (2.0, 0.0, 0.25), (0.5, 0.1, 0.0))  # cost limit, step size and start of the multiplier
@@ -99,6 +100,47 @@ def test_the_threads_of_a_training_are_scheduled_as_a_batch_job() -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)}
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "True"
+
+
+def test_before_an_episode_has_ended_nothing_is_said_of_episodes() -> None:
+    """`Counter` ends after 100 steps; an iteration takes 16, so the first whole episode ends in the seventh."""
+    small = walk_config(method="trpo", env_steps=8 * 64)
+    with quick_compilation():
+        metrics = runner.train(small, Counter(max_episode_steps=100), num_seeds=2).metrics
+    for name, value in (("episode_return", 100.0), ("episode_cost", 200.0), ("episode_length", 100.0)):
+        assert np.isnan(metrics[name][:6]).all()
+        np.testing.assert_array_equal(metrics[name][6:], np.full((2, 2), value))
+    assert all(np.isfinite(rows).all() for name, rows in metrics.items() if name not in runner.EPISODE_ESTIMATES)
+
+
+def test_an_iteration_that_is_taken_back_ends_no_episode() -> None:
+    history = {name: np.ones((4, 1), np.float32) for name in runner.EPISODE_ESTIMATES}
+    history |= {"episodes_finished": np.array([[0], [2], [0], [1]]), "skipped_updates": np.array([[0], [1], [1], [1]])}
+    found = runner._without_unknown(history)
+    assert np.isnan(found["episode_cost"][:3, 0]).all()
+    assert found["episode_cost"][3, 0] == 1
+    assert found["episode_cost"].dtype == np.float32
+
+
+def test_only_the_last_batch_of_an_iteration_is_kept() -> None:
+    """No array of the program holds the steps of all generator steps, which at large sizes would be gigabytes."""
+    config = runner.resolve(walk_config(method="malm", generator_steps=3), Walk(), walk_demonstrations())
+    agent = agents.make(config, Walk(), runner.expert_data(walk_demonstrations()))
+    state = jax.eval_shape(agent.init, jax.random.key(0))
+    shapes = {value.aval.shape for value in values_of(jax.make_jaxpr(agent.step)(state).jaxpr)}
+    batch = (config.num_steps, config.num_envs)
+    assert any(shape[:2] == batch for shape in shapes)
+    assert not any(shape[:3] == (3, *batch) for shape in shapes)
+
+
+def values_of(program: Any) -> Iterator[Any]:
+    """All values of a jaxpr, those inside loops and calls included."""
+    yield from (*program.invars, *program.outvars)
+    for equation in program.eqns:
+        yield from equation.outvars
+        for inner in jax.tree.leaves(list(equation.params.values())):
+            if hasattr(getattr(inner, "jaxpr", inner), "eqns"):
+                yield from values_of(getattr(inner, "jaxpr", inner))
 
 
 def test_only_traced_fields_may_differ() -> None:

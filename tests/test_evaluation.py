@@ -1,0 +1,57 @@
+"""Evaluation: every seed plays episodes of its own, whatever else is evaluated beside it."""
+
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from ccil_jax import evaluation, networks, running_statistics
+from ccil_jax.evaluation import Evaluation
+from ccil_jax.rollout import Actor
+from tests.probe_envs import Walk, same_bits, walk_config
+
+CONFIG = walk_config(method="trpo")
+
+
+def actor(num_seeds: int) -> Actor:
+    """The same policy for every seed, so that only the episodes can differ."""
+    policy = networks.make_policy(CONFIG, Walk().obs_dim, Walk().action_dim)
+    one = Actor(policy_params=policy.init(jax.random.key(1)), obs_statistics=running_statistics.init(Walk().obs_dim))
+    return jax.tree.map(lambda leaf: np.stack([leaf] * num_seeds), one)
+
+
+def evaluate(num_seeds: int, **settings: Any) -> Evaluation:
+    return evaluation.evaluate(CONFIG, actor(num_seeds), Walk(), num_episodes=8, seed=3, **settings)
+
+
+@pytest.fixture(scope="module")
+def three() -> Evaluation:
+    return evaluate(3)
+
+
+def test_every_seed_plays_episodes_of_its_own(three: Evaluation) -> None:
+    assert three.episode_return.shape == (3, 8)
+    assert np.unique(three.episode_return).size == 3 * 8  # no episode twice
+
+
+def test_a_seeds_episodes_do_not_depend_on_the_others(three: Evaluation) -> None:
+    np.testing.assert_allclose(evaluate(1).episode_return[0], three.episode_return[0], rtol=1e-5)
+
+
+def test_shared_episodes_are_those_of_the_first_seed_for_all(three: Evaluation) -> None:
+    shared = evaluate(3, shared_episodes=True)
+    for name in ("episode_return", "episode_cost", "episode_length"):
+        rows = getattr(shared, name)
+        np.testing.assert_array_equal(rows, np.stack([rows[0]] * 3))
+        np.testing.assert_allclose(rows[0], getattr(three, name)[0], rtol=1e-5)
+
+
+def test_the_random_policys_episodes_do_not_depend_on_how_they_are_shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On 1 device and, as far as the padding goes, on 3; an episode's draws follow from its number alone."""
+    few, many = (evaluation.random_policy(Walk(), num_episodes=count, seed=5) for count in (4, 7))
+    assert many.episode_return.shape == (1, 7)
+    assert np.unique(many.episode_return).size == 7
+    np.testing.assert_allclose(few.episode_return, many.episode_return[:, :4], rtol=1e-5)
+    monkeypatch.setattr(evaluation, "usable_devices", lambda: [None] * 3)
+    assert same_bits(evaluation.random_policy(Walk(), num_episodes=7, seed=5), many)
