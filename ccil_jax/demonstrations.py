@@ -138,7 +138,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, default_cost: float | N
     """Reads and checks demonstrations, ours or those of `ccil_jax.formats`, recognised by content.
 
     Runs no code from the file and unpacks at most `npz.MAX_BYTES`. `default_cost` is taken for every step where a
-    file of another format has no costs; without it such a file is refused.
+    file of another format has no costs, and the metadata say so; without it such a file is refused.
 
     Raises `DemonstrationsError`, one line with file, key and remedy, for anything that is not a sound file.
     """
@@ -152,6 +152,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, default_cost: float | N
         if default_cost is None:
             raise DemonstrationsError(f"{path}: {formats.NO_COSTS}")
         arrays["costs"] = np.full(len(arrays["obs"]), default_cost, np.float32)
+        arrays["metadata"] = {**arrays["metadata"], "default_cost": default_cost}  # nobody has measured these costs
     return _checked(arrays, str(path))
 
 

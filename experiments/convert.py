@@ -42,6 +42,10 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.default_cost is not None and not 0 <= arguments.default_cost < float("inf"):
         raise UsageError(f"--default-cost {arguments.default_cost}: must be finite and not negative")
     demonstrations = load_demonstrations(arguments.file, default_cost=arguments.default_cost)
+    if arguments.default_cost not in (None, demonstrations.metadata.get("default_cost")):
+        raise UsageError(
+            f"--default-cost {arguments.default_cost:g}: {arguments.file} has costs of its own; leave it out"
+        )
     check_matches(demonstrations, arguments.file, task)
     command_line.check_writable(out.parent, "--out")
     facts = {"task": task.name, "source": arguments.file.name, "command": command_line.command()}

@@ -387,7 +387,10 @@ def test_without_costs_only_where_a_default_is_given(tmp_path: Path) -> None:
     for path in (minari(tmp_path / "m", cost=None), legacy(tmp_path / "l.npz", accucost=None, costs=None)):
         with pytest.raises(DemonstrationsError, match="holds no cost of each step"):
             load_demonstrations(path)
-        np.testing.assert_array_equal(load_demonstrations(path, default_cost=0.5).costs, np.full(9, 0.5))
+        found = load_demonstrations(path, default_cost=0.5)
+        np.testing.assert_array_equal(found.costs, np.full(9, 0.5))
+        assert found.metadata["default_cost"] == 0.5  # so that a reader knows that nobody has measured them
+    assert "default_cost" not in load_demonstrations(legacy(tmp_path / "own.npz"), default_cost=0.5).metadata
 
 
 def test_the_converter_writes_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -424,6 +427,7 @@ def test_the_converter_answers_wrong_use_in_one_line(tmp_path: Path, capsys: pyt
         ((path, "--env", "Swimmer", "--out", path), "exists"),
         ((path, "--env", "Swimmer", "--out", "x.h5"), "named *.npz"),
         ((path, "--env", "Swimmer", *out, "--default-cost", "nan"), "--default-cost nan"),
+        ((path, "--env", "Swimmer", *out, "--default-cost", "0"), "expert.npz has costs of its own; leave it out"),
     ):
         with pytest.raises(SystemExit) as end:
             convert.main(arguments)
