@@ -83,7 +83,7 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     for num_envs in arguments.num_envs:
         changes[num_envs] = _batch(arguments.preset, num_envs, arguments.batch_size)
         chosen = {"method": arguments.method, "num_envs": num_envs}
-        options.config_from(chosen, arguments.preset, changes[num_envs])
+        options.config_from(chosen, arguments.preset, {"cost_limit": 0.0, **changes[num_envs]})
     return [
         {
             "task": options.find_task(task, "--tasks").name,
@@ -104,19 +104,15 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
-def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, float]:
-    """Changes to the preset, so that `num_envs` simulations fill its batch or, where they are many, a larger one.
-
-    Methods with a prescribed limit get one too; it does not matter for their speed.
-    """
+def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]:
+    """Changes to the preset, so that `num_envs` simulations fill its batch or, where they are many, a larger one."""
     config = Config(**PRESETS[preset])
     if batch_size is None:
         least = max(config.batch_size, _LEAST_STEPS * num_envs)
         batch_size = math.ceil(least / num_envs) * num_envs
     times = max(1, batch_size // config.batch_size)
     minibatches = ("critic_minibatch_size", "discriminator_minibatch_size")
-    sizes = {name: times * getattr(config, name) for name in minibatches}
-    return {"batch_size": batch_size, **sizes, "cost_limit": 0.0}
+    return {"batch_size": batch_size} | {name: times * getattr(config, name) for name in minibatches}
 
 
 def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
@@ -202,7 +198,7 @@ def print_profiles(rows: Sequence[dict[str, Any]]) -> None:
 
 def _beside(setting: dict[str, Any], peer: peers.Peer, num_seeds: int) -> dict[str, Any]:
     """The row of ours that does a peer's work: its task and method, and batches of 2000 steps as there."""
-    changes = {"batch_size": 2000, "cost_limit": 0.0}
+    changes = {"batch_size": 2000}
     return {**setting, "task": peer.task, "method": peer.method, "num_seeds": num_seeds, "changes": changes}
 
 

@@ -52,7 +52,7 @@ def settings_of(arguments: argparse.Namespace) -> list[tuple[str, int, dict[str,
         for value in AXES[axis]:
             if arguments.largest and value > arguments.largest:
                 continue
-            changes: dict[str, Any] = {"batch_size": 4096 if axis == "simulations" else 2000, "cost_limit": 0.0}
+            changes: dict[str, Any] = {"batch_size": 4096 if axis == "simulations" else 2000}
             if axis == "width":
                 changes["hidden_sizes"] = [value, value]
             setting = {
