@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 PyTree = Any
@@ -94,7 +95,10 @@ def next_state(
 
 
 class Environment(Protocol):
-    """What a learner may assume. Actions outside `[action_low, action_high]` are clipped by `step`."""
+    """What a learner may assume of a task.
+
+    `step` clips actions to `[action_low, action_high]`, and refuses an action of another shape by a `ValueError`.
+    """
 
     @property
     def name(self) -> str:
@@ -125,6 +129,36 @@ class Environment(Protocol):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. `action` is `[action_dim]`; stepping a done state is undefined."""
+
+
+def check_shape(what: str, array: jax.typing.ArrayLike, expected: tuple[int, ...]) -> None:
+    """Refuses an array of another shape, which NumPy's rules would silently repeat along the axes that it lacks.
+
+    Shapes are known while JAX traces, so the check costs nothing in a compiled program.
+
+    Args:
+        what: the task and the argument, for the message.
+        array: the argument.
+        expected: its only right shape.
+
+    Raises:
+        ValueError: the shape is another.
+    """
+    found = np.shape(array)
+    if found != expected:
+        raise ValueError(f"{what} must have shape {expected}, but has shape {found}")
+
+
+def executed(env: "Environment", action: jax.typing.ArrayLike) -> jax.Array:
+    """[action_dim]: what the actuators get for an action, namely the action clipped to the task's range.
+
+    Raises:
+        ValueError: the action is not one number for each actuator.
+    """
+    check_shape(f"{env.name}: an action", action, (env.action_dim,))
+    dtype = jnp.result_type(float)
+    low, high = jnp.asarray(env.action_low, dtype), jnp.asarray(env.action_high, dtype)
+    return jnp.clip(jnp.asarray(action, dtype), low, high)
 
 
 def full_precision(function: Callable[Arguments, Tree]) -> Callable[Arguments, Tree]:
