@@ -15,6 +15,9 @@ from flax import struct
 
 PyTree = Any
 Tree = TypeVar("Tree")
+Carry = TypeVar("Carry")
+Inputs = TypeVar("Inputs")
+Outputs = TypeVar("Outputs")
 Arguments = ParamSpec("Arguments")
 
 
@@ -176,6 +179,20 @@ def full_precision(function: Callable[Arguments, Tree]) -> Callable[Arguments, T
     return traced
 
 
+def usual_rules(function: Callable[Arguments, Tree]) -> Callable[Arguments, Tree]:
+    """`function`, traced under JAX's usual rules for mixing types and ranks, whatever is asked of code around it.
+
+    For code of other packages, which a user of JAX's strict modes cannot change.
+    """
+
+    @functools.wraps(function)
+    def traced(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Tree:
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return traced
+
+
 def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tree, *args: PyTree) -> Tree:
     """`compute(*args)` where `needed` [] bool, else `otherwise`: for what is dear and rarely needed, as a reset.
 
@@ -189,6 +206,19 @@ def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tr
         return jnp.zeros_like(needed), compute(*jax.tree.map(_like, args, bound))
 
     return jax.lax.while_loop(lambda carry: carry[0], turn, (needed, otherwise))[1]
+
+
+def scan(turn: Callable[[Carry, Inputs], tuple[Carry, Outputs]], carry: Carry, inputs: Inputs) -> tuple[Carry, Outputs]:
+    """`jax.lax.scan`, for inputs among which there are random keys.
+
+    Vmapped, a scan moves the axis that it goes along to the front, and JAX's check of key reuse takes a key whose axes
+    were moved for a used one. So keys are handed to the loop as plain numbers, and are keys again in each turn.
+    """
+
+    def plain_turn(carry: Carry, plain: PyTree) -> tuple[Carry, Outputs]:
+        return turn(carry, jax.tree.map(_like, inputs, plain))
+
+    return jax.lax.scan(plain_turn, carry, jax.tree.map(numbers, inputs))
 
 
 def numbers(leaf: jax.Array) -> jax.Array:

@@ -37,6 +37,7 @@ ORDER = (
     "networks",
     "running_statistics",
     "shuffling",
+    "optimizers",
     "returns",
     "demonstrations",
     "rollout",
