@@ -79,7 +79,7 @@ llvmlite.binding.add_symbol("ccil_jax_engines", _getter.address)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]  # numba is untyped
+class _Cache(FunctionCache):
     """Numba's files of compiled code, as a convenience: where they cannot be read or written, code is compiled anew."""
 
     def load_overload(self, *args: Any) -> Any:
