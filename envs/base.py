@@ -203,7 +203,7 @@ def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tr
         # The barrier ties the arguments to this turn: XLA moves out of a loop what depends on nothing in it. Keys pass
         # it as plain numbers: JAX's check of key reuse does not know that the loop turns once.
         needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(numbers, args)))
-        return jnp.zeros_like(needed), compute(*jax.tree.map(_like, args, bound))
+        return jnp.zeros_like(needed), compute(*jax.tree.map(as_before, args, bound))
 
     return jax.lax.while_loop(lambda carry: carry[0], turn, (needed, otherwise))[1]
 
@@ -216,7 +216,7 @@ def scan(turn: Callable[[Carry, Inputs], tuple[Carry, Outputs]], carry: Carry, i
     """
 
     def plain_turn(carry: Carry, plain: PyTree) -> tuple[Carry, Outputs]:
-        return turn(carry, jax.tree.map(_like, inputs, plain))
+        return turn(carry, jax.tree.map(as_before, inputs, plain))
 
     return jax.lax.scan(plain_turn, carry, jax.tree.map(numbers, inputs))
 
@@ -226,7 +226,8 @@ def numbers(leaf: jax.Array) -> jax.Array:
     return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
-def _like(leaf: jax.Array, plain: jax.Array) -> jax.Array:
+def as_before(leaf: jax.Array, plain: jax.Array) -> jax.Array:
+    """What `numbers` made of a leaf like `leaf`, as it was: a random key where `leaf` is one."""
     return jax.random.wrap_key_data(plain, impl=jax.random.key_impl(leaf)) if is_key(leaf) else plain
 
 
