@@ -11,6 +11,7 @@ from ccil_jax import distributions, networks, running_statistics
 from ccil_jax.config import Config
 from ccil_jax.distributions import Gaussian
 from ccil_jax.on_policy import Agent, initial_std
+from ccil_jax.optimizers import adam
 from ccil_jax.rollout import Actor
 from ccil_jax.shuffling import minibatches
 from ccil_jax.types import ExpertData, Metrics, PyTree
@@ -41,7 +42,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     """Builds the agent; an iteration is one pass over the demonstrations."""
     assert expert is not None, "bc learns from demonstrations"
     policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
-    optimizer = optax.adam(config.actor_learning_rate)
+    optimizer = adam(config.actor_learning_rate)
     statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
     obs = running_statistics.normalize(statistics, expert.obs)
     held_out_obs = running_statistics.normalize(statistics, expert.held_out_obs)

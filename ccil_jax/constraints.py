@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jaxtyping import Array, Float
 
 from ccil_jax.config import Config
 from ccil_jax.multipliers import Gains, optimal_weights, pid_init, pid_step
+from ccil_jax.optimizers import adam
 from ccil_jax.types import Metrics, PyTree
 
 # Adam moves xi by about its learning rate an update, so after a long time within the limit a vanishing softplus(xi)
@@ -229,7 +229,7 @@ def ascent(config: Config) -> Ascent:
     """The parametrisation `config.multiplier_update` and the outer step `config.meta_update`."""
     parametrize = {"adam": softplus_parameter, "sgd": projected_parameter}[config.multiplier_update]
     read, write = parametrize(config.multiplier_max)
-    optimizer, outer_optimizer = optax.adam(config.multiplier_learning_rate), optax.adam(config.meta_learning_rate)
+    optimizer, outer_optimizer = adam(config.multiplier_learning_rate), adam(config.meta_learning_rate)
 
     def init() -> Multiplier:
         parameter = write(jnp.asarray(config.initial_multiplier, jnp.result_type(float)))

@@ -28,8 +28,9 @@ class TanhGaussian:
 def sample(distribution: Gaussian | TanhGaussian, noise: Float[Array, "... A"]) -> Float[Array, "... A"]:
     """The actions that standard normal `noise` maps to; no noise gives the mode (of the Gaussian before squashing)."""
     if isinstance(distribution, TanhGaussian):
-        return distribution.center + distribution.half_range * jnp.tanh(sample(distribution.gaussian, noise))
-    return distribution.mean + jnp.exp(distribution.log_std) * noise
+        unit = jnp.tanh(sample(distribution.gaussian, noise))
+        return _wide(distribution.center, unit) + _wide(distribution.half_range, unit) * unit
+    return distribution.mean + _wide(jnp.exp(distribution.log_std), noise) * noise
 
 
 def sample_unit(
@@ -45,15 +46,16 @@ def sample_unit(
 
 def log_prob(distribution: Gaussian, action: Float[Array, "... A"]) -> Float[Array, "..."]:
     """Log density of `action`, nats, summed over action dimensions."""
-    standardized = (action - distribution.mean) * jnp.exp(-distribution.log_std)
+    standardized = (action - distribution.mean) * _wide(jnp.exp(-distribution.log_std), action)
     return -0.5 * jnp.sum(standardized**2 + math.log(2 * math.pi), axis=-1) - jnp.sum(distribution.log_std)
 
 
 def kl_divergence(old: Gaussian, new: Gaussian) -> Float[Array, "..."]:
     """KL(old || new), nats, summed over action dimensions."""
     variance_ratio = jnp.exp(2 * (old.log_std - new.log_std))
-    shift = (old.mean - new.mean) * jnp.exp(-new.log_std)
-    return jnp.sum(new.log_std - old.log_std + 0.5 * (variance_ratio + shift**2 - 1), axis=-1)
+    shift = (old.mean - new.mean) * _wide(jnp.exp(-new.log_std), new.mean)
+    spread = _wide(new.log_std - old.log_std, shift)
+    return jnp.sum(spread + 0.5 * (_wide(variance_ratio, shift) + shift**2 - 1), axis=-1)
 
 
 def entropy(distribution: Gaussian) -> Float[Array, ""]:
@@ -63,4 +65,10 @@ def entropy(distribution: Gaussian) -> Float[Array, ""]:
 
 def fisher_product(distribution: Gaussian, tangent: Gaussian) -> Gaussian:
     """The Fisher information in (mean, log_std) coordinates, per sample, times a tangent: diag(1/std^2, 2)."""
-    return Gaussian(mean=tangent.mean * jnp.exp(-2 * distribution.log_std), log_std=2 * tangent.log_std)
+    precision = _wide(jnp.exp(-2 * distribution.log_std), tangent.mean)
+    return Gaussian(mean=tangent.mean * precision, log_std=2 * tangent.log_std)
+
+
+def _wide(per_action: jax.Array, like: jax.Array) -> jax.Array:
+    """[..., A]: what is the same in every state, for each of the states of `like`."""
+    return jnp.broadcast_to(per_action, like.shape)

@@ -1,5 +1,6 @@
 """Whole episodes of a fixed policy: evaluation, recording of demonstrations, and the random policy."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +16,7 @@ from ccil_jax.demonstrations import Demonstrations
 from ccil_jax.program import run_mesh, usable_devices
 from ccil_jax.rollout import Actor, act
 from ccil_jax.types import PyTree
-from envs.base import Environment, State, full_precision
+from envs.base import Environment, State, executed, full_precision
 
 
 @struct.dataclass(kw_only=True)
@@ -51,7 +52,7 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
 
     def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple[State, jax.Array], Episodes]:
         state, running = carry
-        action = jnp.clip(policy(state.obs, key), jnp.asarray(env.action_low), jnp.asarray(env.action_high))
+        action = jax.vmap(functools.partial(executed, env))(policy(state.obs, key))
         stepped = jax.vmap(env.step)(state, action)
         episodes = Episodes(
             obs=state.obs,
@@ -91,12 +92,13 @@ def _uniform(env: Environment) -> Act:
 
 def _totals(episodes: Episodes) -> Evaluation:
     return Evaluation(
-        episode_return=jnp.sum(episodes.reward * episodes.valid, axis=0),
-        episode_cost=jnp.sum(episodes.cost * episodes.valid, axis=0),
+        episode_return=jnp.sum(jnp.where(episodes.valid, episodes.reward, 0.0), axis=0),
+        episode_cost=jnp.sum(jnp.where(episodes.valid, episodes.cost, 0.0), axis=0),
         episode_length=jnp.sum(episodes.valid, axis=0),
     )
 
 
+@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def evaluate(
     config: Config,
     actor: Actor,
@@ -125,6 +127,7 @@ def evaluate(
     return _spread(run, (actor, keys))
 
 
+@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) -> Evaluation:
     """The same for uniformly random actions; arrays are [1, num_episodes]."""
     num_devices = len(usable_devices())
@@ -146,6 +149,7 @@ def _spread(run: Callable[[Any], Evaluation], runs: PyTree) -> Evaluation:
     return jax.tree.map(np.asarray, jax.jit(shared)(placed))
 
 
+@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def record(
     config: Config,
     actor: Actor,

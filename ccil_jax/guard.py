@@ -51,7 +51,7 @@ def protect(agent: Agent, max_skipped: int) -> Agent:
         alive = state.skipped_in_a_row < max_skipped
         ok = all_finite(metrics) & stays_finite(old, new)
         fault = alive & ~ok
-        in_a_row = jnp.where(alive & ok, 0, state.skipped_in_a_row + fault)
+        in_a_row = jnp.where(alive & ok, 0, state.skipped_in_a_row + fault.astype(jnp.int32))
 
         def take_back(old: PyTree, new: PyTree) -> PyTree:
             keys = jax.tree.map(lambda before, after: after if is_key(before) else before, old, new)
@@ -59,7 +59,7 @@ def protect(agent: Agent, max_skipped: int) -> Agent:
 
         # Almost never needed, so nothing is copied; and a step that no code follows rounds as it does unguarded.
         held = compute_where(~(alive & ok), take_back, new, old, new)
-        skipped = state.skipped + fault
+        skipped = state.skipped + fault.astype(jnp.int32)
         guarded = GuardedState(agent=held, skipped=skipped, skipped_in_a_row=in_a_row)
         return guarded, metrics | {"skipped_updates": skipped}
 

@@ -18,10 +18,11 @@ from ccil_jax import distributions, networks, replay, rollout
 from ccil_jax.config import Config
 from ccil_jax.networks import Network, SquashedPolicy
 from ccil_jax.on_policy import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
+from ccil_jax.optimizers import adam
 from ccil_jax.replay import Replay
 from ccil_jax.rollout import Actor, RolloutState
 from ccil_jax.types import ExpertData, Metrics, PyTree, Transition
-from envs.base import Environment
+from envs.base import Environment, scan
 
 TEMPERATURES = {"Ant": 1e-3, "Humanoid": 0.3}  # published, by task
 USUAL_TEMPERATURE = 1e-2  # Hopper, Walker2d, HalfCheetah
@@ -101,7 +102,7 @@ def updates(config: Config, policy: SquashedPolicy, critic: Network, action_dim:
     """One update of the critic, then one of the policy (SAC's), then the target critic follows."""
     assert config.temperature is not None, "resolved by the runner"
     temperature = config.temperature
-    policy_optimizer, critic_optimizer = optax.adam(config.actor_learning_rate), optax.adam(config.critic_learning_rate)
+    policy_optimizer, critic_optimizer = adam(config.actor_learning_rate), adam(config.critic_learning_rate)
 
     def init(key: jax.Array) -> Learner:
         policy_key, critic_key = jax.random.split(key)
@@ -202,7 +203,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
 
         return Minibatch(
             obs=both("obs"),
-            action=(2 * both("action") - (high + low)) / (high - low),
+            action=(2 * both("action") - (high + low)[None]) / (high - low)[None],
             next_obs=both("next_obs"),
             terminated=both("terminated"),
             initial_obs=steps.initial_obs,
@@ -218,14 +219,14 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             batch_key, noise_key = jax.random.split(key)
             return update.step(learner, minibatch(memory, batch_key), noise_key)
 
-        learner, metrics = jax.lax.scan(learn, state.learner, keys)
+        learner, metrics = scan(learn, state.learner, keys)
         new = dataclasses.replace(state, learner=learner, replay=memory, rollout=rollout_state)
         return new, (jax.tree.map(lambda x: x[0], transition), metrics)
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, steps_key = jax.random.split(state.key)
         keys = jax.random.split(steps_key, config.generator_steps * config.num_steps)
-        state, (transition, metrics) = jax.lax.scan(act_and_learn, state, keys)
+        state, (transition, metrics) = scan(act_and_learn, state, keys)
         estimates, finished = estimate_episodes(state.estimates, transition)
         iteration = state.iteration + 1
         cost_rate = running_mean(state.cost_rate, jnp.mean(transition.cost), iteration)

@@ -28,7 +28,7 @@ from ccil_jax.returns import gae, successor_values
 from ccil_jax.reward_models import RewardModel
 from ccil_jax.rollout import Actor, RolloutState
 from ccil_jax.types import Batch, ExpertData, Metrics, PyTree, Transition
-from envs.base import Environment
+from envs.base import Environment, scan
 
 REWARD, COST = 0, 1  # order along every axis of length 2: critics, signals, directions, weights
 
@@ -156,7 +156,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, generator_key, reward_key = jax.random.split(state.key, 3)
         generator_keys = jax.random.split(generator_key, config.generator_steps)
-        (state, (transition, taken, order)), generator_metrics = jax.lax.scan(
+        (state, (transition, taken, order)), generator_metrics = scan(
             keep_last, (state, _blank(generator_step, state, generator_keys[0])), generator_keys
         )
 
@@ -207,7 +207,8 @@ def estimate_episodes(previous: EpisodeEstimates, transition: Transition) -> tup
     count = jnp.sum(ends)
 
     def mean(totals: jax.Array, carried: jax.Array) -> jax.Array:
-        return jnp.where(count > 0, jnp.sum(jnp.where(ends, totals, 0.0)) / jnp.maximum(count, 1), carried)
+        total = jnp.sum(jnp.where(ends, totals.astype(carried.dtype), 0.0))
+        return jnp.where(count > 0, total / jnp.maximum(count, 1).astype(carried.dtype), carried)
 
     return EpisodeEstimates(
         episode_return=mean(transition.episode_return, previous.episode_return),
@@ -218,7 +219,7 @@ def estimate_episodes(previous: EpisodeEstimates, transition: Transition) -> tup
 
 def running_mean(mean: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array:
     """The mean of `count` values, of which `new` is the last and `mean` that of the others."""
-    return mean + (new - mean) / count
+    return mean + (new - mean) / count.astype(mean.dtype)
 
 
 def episode_metrics(estimates: EpisodeEstimates, cost_rate: jax.Array) -> Metrics:
@@ -233,7 +234,7 @@ def episode_metrics(estimates: EpisodeEstimates, cost_rate: jax.Array) -> Metric
 
 def episodes_of_steps(transition: Transition, limit: jax.Array, max_episode_steps: int) -> Episodes:
     """The cost of each step's episode: known if it ends within the batch, else extrapolated at its rate so far."""
-    rate = transition.episode_cost / transition.episode_length
+    rate = transition.episode_cost / transition.episode_length.astype(transition.episode_cost.dtype)
     last = transition.done.at[-1].set(True)
     final = jnp.where(transition.done, transition.episode_cost, rate * max_episode_steps)
 

@@ -36,7 +36,7 @@ def random_order(config: Config, key: jax.Array) -> jax.Array:
         return permutation(key, config.batch_size)
     simulations = permutation(key, config.num_envs)  # a simulation's whole stretch of the batch stays together
     steps = jnp.arange(config.num_steps) * config.num_envs
-    return (simulations[:, None] + steps).reshape(-1)
+    return (simulations[:, None] + steps[None]).reshape(-1)
 
 
 def split(samples: Batch, num_held_out: int, order: jax.Array) -> tuple[Batch, Batch]:
@@ -71,7 +71,7 @@ def improve(
         weights = importance(distributions.log_prob(new, batch.action), old_log_prob)
         bonus = config.policy_entropy_coefficient * distributions.entropy(new)
         reward = jnp.mean(weights * batch.reward_advantage) + bonus
-        cost = jnp.mean(weights * batch.cost_advantage) - bonus * constraint.entropy_in_cost
+        cost = jnp.mean(weights * batch.cost_advantage) - bonus * float(constraint.entropy_in_cost)
         return jnp.stack([reward, cost]), jnp.mean(distributions.kl_divergence(old, new))
 
     gradients = jax.jacrev(lambda params: objectives(params)[0])(params)

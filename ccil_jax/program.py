@@ -23,7 +23,7 @@ from ccil_jax.config import Config
 from ccil_jax.guard import GuardedState
 from ccil_jax.on_policy import Agent
 from ccil_jax.types import ExpertData, Metrics
-from envs.base import Environment, full_precision
+from envs.base import Environment, as_before, full_precision, numbers
 
 LONGEST_CHUNK = 10  # iterations between two looks from Python
 Varied = Mapping[str, jax.Array]  # [R]: traced fields that are not the same in all runs
@@ -115,10 +115,15 @@ def _compiler(
             )
 
             def turn(index: jax.Array, carry: tuple[GuardedState, Metrics]) -> tuple[GuardedState, Metrics]:
-                state, row = step(own, expert, carry[0])
-                return state, jax.tree.map(lambda rows, value: rows.at[index].set(value), carry[1], row)
+                state_now = jax.tree.map(as_before, state, carry[0])
+                state_next, row = step(own, expert, state_now)
+                return jax.tree.map(numbers, state_next), jax.tree.map(
+                    lambda rows, value: rows.at[index].set(value), carry[1], row
+                )
 
-            return jax.lax.fori_loop(0, length, turn, (state, blank))
+            # Keys pass as plain numbers: JAX's check of key reuse cannot follow vmapped keys around a loop.
+            plain, rows = jax.lax.fori_loop(0, length, turn, (jax.tree.map(numbers, state), blank))
+            return jax.tree.map(as_before, state, plain), rows
 
         return jax.vmap(iterate)(varied, state)
 

@@ -8,6 +8,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
+from ccil_jax.optimizers import adam
 from ccil_jax.shuffling import minibatches
 from ccil_jax.types import PyTree
 
@@ -22,7 +23,7 @@ class Critic:
 
 def init(params: PyTree, learning_rate: Float[Array, ""] | float) -> Critic:
     """A critic that has not been fitted."""
-    return Critic(params=params, optimizer=optax.adam(learning_rate).init(params))
+    return Critic(params=params, optimizer=adam(learning_rate).init(params))
 
 
 def fit(
@@ -41,7 +42,7 @@ def fit(
     Returns:
         The fitted critic, and the mean loss over the last epoch.
     """
-    optimizer = optax.adam(learning_rate)
+    optimizer = adam(learning_rate)
 
     def loss(params: PyTree, indices: jax.Array) -> jax.Array:
         return jnp.mean((apply(params, obs[indices]) - target[indices]) ** 2)

@@ -30,8 +30,8 @@ def gae(
     Returns:
         (advantage, advantage + value).
     """
-    residual = signal + gamma * next_value * (1 - terminated) - value
-    decay = gamma * gae_lambda * (1 - done)
+    residual = signal + gamma * next_value * (1 - terminated.astype(signal.dtype)) - value
+    decay = gamma * gae_lambda * (1 - done.astype(signal.dtype))
 
     def backwards(following: jax.Array, step: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         residual_t, decay_t = step

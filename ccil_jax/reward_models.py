@@ -17,9 +17,11 @@ from jaxtyping import Array, Float
 from ccil_jax import running_statistics
 from ccil_jax.config import Config
 from ccil_jax.networks import Network
+from ccil_jax.optimizers import adam
 from ccil_jax.running_statistics import RunningStatistics
 from ccil_jax.shuffling import minibatches
 from ccil_jax.types import ExpertData, Metrics, PyTree, Transition
+from envs.base import scan
 
 
 class RewardModel(NamedTuple):
@@ -114,7 +116,7 @@ def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim:
     It judges the learner's actions as they were sampled. Once clipped as the environment executes them, all actions
     beyond the range would earn alike, and a policy whose mean has left the range would have no way back.
     """
-    optimizer = optax.adam(config.discriminator_learning_rate)
+    optimizer = adam(config.discriminator_learning_rate)
     if config.discriminator_regularizer == "spectral_norm":
         network = spectrally_normalized(network)
 
@@ -173,7 +175,7 @@ def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim:
             indices, key = minibatch
             return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
 
-        state, metrics = jax.lax.scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
+        state, metrics = scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
         held_out = network.apply(state.params, inputs(state.statistics, expert.held_out_obs, expert.held_out_action))
         return state, jax.tree.map(jnp.mean, metrics) | {"discriminator_accuracy_held_out": jnp.mean(held_out > 0)}
 

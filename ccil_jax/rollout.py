@@ -5,13 +5,14 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from ccil_jax import distributions, running_statistics
 from ccil_jax.distributions import Gaussian, TanhGaussian
 from ccil_jax.running_statistics import RunningStatistics
 from ccil_jax.types import PyTree, Transition
-from envs.base import Environment, State, compute_where, full_precision
+from envs.base import Environment, State, compute_where, full_precision, scan
 
 
 @struct.dataclass(kw_only=True)
@@ -44,7 +45,8 @@ def act(policy_apply: PolicyApply, actor: Actor, obs: jax.Array, noise: jax.Arra
 def init(env: Environment, num_envs: int, key: jax.Array) -> RolloutState:
     """Fresh episodes whose time limits are staggered evenly, so that episodes do not all end in one batch."""
     env_state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
-    offset = jnp.arange(num_envs, dtype=jnp.int32) * env.max_episode_steps // num_envs
+    # Counted by the host: 32 bits are too few for the product.
+    offset = jnp.asarray(np.arange(num_envs, dtype=np.int64) * env.max_episode_steps // num_envs, jnp.int32)
     return RolloutState(
         env_state=dataclasses.replace(env_state, step_count=env_state.step_count + offset),
         episode_length=jnp.zeros(num_envs, jnp.int32),
@@ -109,4 +111,4 @@ def rollout(
             transition,
         )
 
-    return jax.lax.scan(step, state, (noise, reset_keys))
+    return scan(step, state, (noise, reset_keys))

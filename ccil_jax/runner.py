@@ -190,6 +190,7 @@ def train(
     )[0]
 
 
+@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def train_runs(
     configs: Sequence[Config],
     env: Environment,
@@ -322,6 +323,7 @@ def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, j
     return first, varied
 
 
+@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def save(result: Result, directory: Path) -> None:
     """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs.
 
@@ -337,6 +339,7 @@ def _restore(checkpoints: Checkpointer, step: int, program: Program) -> tuple[Gu
     return saved["state"], saved["history"]
 
 
+@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
     """The policies of the newest checkpoint in `checkpoint_dir`. Demonstrations are not needed.
 

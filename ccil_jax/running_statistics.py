@@ -32,7 +32,7 @@ def update(statistics: RunningStatistics, samples: Float[Array, "... D"]) -> Run
     batch_mean = jnp.mean(samples, axis=0)
     count = statistics.count + size
     delta = batch_mean - statistics.mean
-    spread = jnp.sum((samples - batch_mean) ** 2, axis=0) + delta**2 * (statistics.count * size / count)
+    spread = jnp.sum((samples - batch_mean[None]) ** 2, axis=0) + delta**2 * (statistics.count * size / count)
     return RunningStatistics(
         count=count, mean=statistics.mean + delta * (size / count), sum_squares=statistics.sum_squares + spread
     )
@@ -48,4 +48,5 @@ def normalize(statistics: RunningStatistics | None, samples: Float[Array, "... D
     """Zero mean, unit deviation, clipped to [-5, 5]; samples as they are where there are no statistics."""
     if statistics is None:
         return samples
-    return jnp.clip((samples - statistics.mean) / std(statistics), -CLIP, CLIP)
+    mean, deviation = (jnp.broadcast_to(x, samples.shape) for x in (statistics.mean, std(statistics)))
+    return jnp.clip((samples - mean) / deviation, -CLIP, CLIP)

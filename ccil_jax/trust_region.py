@@ -139,11 +139,14 @@ def step(
     def finite(candidate: jax.Array, gain: jax.Array, kl: jax.Array) -> jax.Array:
         return jnp.isfinite(gain) & jnp.isfinite(kl) & jnp.all(jnp.isfinite(candidate))
 
+    def halved(times: jax.Array) -> jax.Array:
+        return jax.lax.pow(jnp.asarray(0.5, params.dtype), times)
+
     def within(kl: jax.Array) -> jax.Array:
         return kl <= kl_tolerance * max_kl
 
     def attempt(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        candidate = propose(params, along, weights, max_kl, 0.5**index)
+        candidate = propose(params, along, weights, max_kl, halved(index))
         objectives, kl = evaluate(candidate)
         gain = weights @ objectives - before
         return candidate, gain, kl, finite(candidate, gain, kl) & within(kl) & (gain >= 0)
@@ -161,7 +164,7 @@ def step(
     tried, candidate, gain, kl, accepted = jax.lax.while_loop(unfinished, shrink, start)
     # Directions that cancel are accepted as a step of nothing: that counts as no step.
     moved = accepted & jnp.any(candidate != params)
-    fraction = jnp.where(moved, 0.5 ** (tried - 1.0), 0.0)
+    fraction = jnp.where(moved, halved(tried - 1), 0.0)
     sound = finite(candidate, gain, kl)
     reasons = {
         "rejected_not_finite": ~accepted & ~sound,

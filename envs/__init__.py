@@ -6,7 +6,7 @@ Importing this package imports neither JAX nor an engine (PEP 562): launchers an
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from envs.registry import PHYSICS, TASKS, TaskInfo
+from envs.registry import PHYSICS, TASKS, TaskInfo, check_options, find_task
 
 if TYPE_CHECKING:
     from envs.base import Environment, State
@@ -32,14 +32,12 @@ def make(name: str, physics: str = "auto", **options: Any) -> "Environment":
         The environment: `reset(key)`, `step(state, action)`, single simulation, to be vmapped.
 
     Raises:
-        ValueError: unknown task or physics.
+        ValueError: unknown task, physics or option, or a value that the option cannot have.
         ImportError: "warp" without the extra `mujoco-mjx[warp]`.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}: choose one of {', '.join(TASKS)}")
-    if physics not in PHYSICS:
-        raise ValueError(f"unknown physics {physics!r}: choose one of {', '.join(PHYSICS)}")
-    module, builder = _FAMILIES[TASKS[name].family]
+    task = find_task(name)
+    check_options(task, physics, options)
+    module, builder = _FAMILIES[task.family]
     environment: Environment = getattr(importlib.import_module(module), builder)(name, physics=physics, **options)
     return environment
 

@@ -10,10 +10,14 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 PyTree = Any
 Tree = TypeVar("Tree")
+Carry = TypeVar("Carry")
+Inputs = TypeVar("Inputs")
+Outputs = TypeVar("Outputs")
 Arguments = ParamSpec("Arguments")
 
 
@@ -94,7 +98,10 @@ def next_state(
 
 
 class Environment(Protocol):
-    """What a learner may assume. Actions outside `[action_low, action_high]` are clipped by `step`."""
+    """What a learner may assume of a task.
+
+    `step` clips actions to `[action_low, action_high]`, and refuses an action of another shape by a `ValueError`.
+    """
 
     @property
     def name(self) -> str:
@@ -127,6 +134,36 @@ class Environment(Protocol):
         """Advances one control step. `action` is `[action_dim]`; stepping a done state is undefined."""
 
 
+def check_shape(what: str, array: jax.typing.ArrayLike, expected: tuple[int, ...]) -> None:
+    """Refuses an array of another shape, which NumPy's rules would silently repeat along the axes that it lacks.
+
+    Shapes are known while JAX traces, so the check costs nothing in a compiled program.
+
+    Args:
+        what: the task and the argument, for the message.
+        array: the argument.
+        expected: its only right shape.
+
+    Raises:
+        ValueError: the shape is another.
+    """
+    found = np.shape(array)
+    if found != expected:
+        raise ValueError(f"{what} must have shape {expected}, but has shape {found}")
+
+
+def executed(env: "Environment", action: jax.typing.ArrayLike) -> jax.Array:
+    """[action_dim]: what the actuators get for an action, namely the action clipped to the task's range.
+
+    Raises:
+        ValueError: the action is not one number for each actuator.
+    """
+    check_shape(f"{env.name}: an action", action, (env.action_dim,))
+    dtype = jnp.result_type(float)
+    low, high = jnp.asarray(env.action_low, dtype), jnp.asarray(env.action_high, dtype)
+    return jnp.clip(jnp.asarray(action, dtype), low, high)
+
+
 def full_precision(function: Callable[Arguments, Tree]) -> Callable[Arguments, Tree]:
     """`function`, traced so that its products of matrices are of full precision.
 
@@ -142,6 +179,20 @@ def full_precision(function: Callable[Arguments, Tree]) -> Callable[Arguments, T
     return traced
 
 
+def usual_rules(function: Callable[Arguments, Tree]) -> Callable[Arguments, Tree]:
+    """`function`, traced under JAX's usual rules for mixing types and ranks, whatever is asked of code around it.
+
+    For code of other packages, which a user of JAX's strict modes cannot change.
+    """
+
+    @functools.wraps(function)
+    def traced(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Tree:
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return traced
+
+
 def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tree, *args: PyTree) -> Tree:
     """`compute(*args)` where `needed` [] bool, else `otherwise`: for what is dear and rarely needed, as a reset.
 
@@ -152,9 +203,22 @@ def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tr
         # The barrier ties the arguments to this turn: XLA moves out of a loop what depends on nothing in it. Keys pass
         # it as plain numbers: JAX's check of key reuse does not know that the loop turns once.
         needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(numbers, args)))
-        return jnp.zeros_like(needed), compute(*jax.tree.map(_like, args, bound))
+        return jnp.zeros_like(needed), compute(*jax.tree.map(as_before, args, bound))
 
     return jax.lax.while_loop(lambda carry: carry[0], turn, (needed, otherwise))[1]
+
+
+def scan(turn: Callable[[Carry, Inputs], tuple[Carry, Outputs]], carry: Carry, inputs: Inputs) -> tuple[Carry, Outputs]:
+    """`jax.lax.scan`, for inputs among which there are random keys.
+
+    Vmapped, a scan moves the axis that it goes along to the front, and JAX's check of key reuse takes a key whose axes
+    were moved for a used one. So keys are handed to the loop as plain numbers, and are keys again in each turn.
+    """
+
+    def plain_turn(carry: Carry, plain: PyTree) -> tuple[Carry, Outputs]:
+        return turn(carry, jax.tree.map(as_before, inputs, plain))
+
+    return jax.lax.scan(plain_turn, carry, jax.tree.map(numbers, inputs))
 
 
 def numbers(leaf: jax.Array) -> jax.Array:
@@ -162,7 +226,8 @@ def numbers(leaf: jax.Array) -> jax.Array:
     return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
-def _like(leaf: jax.Array, plain: jax.Array) -> jax.Array:
+def as_before(leaf: jax.Array, plain: jax.Array) -> jax.Array:
+    """What `numbers` made of a leaf like `leaf`, as it was: a random key where `leaf` is one."""
     return jax.random.wrap_key_data(plain, impl=jax.random.key_impl(leaf)) if is_key(leaf) else plain
 
 

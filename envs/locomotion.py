@@ -17,7 +17,7 @@ import mujoco
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
-from envs.base import State, first_state, next_state
+from envs.base import State, check_shape, executed, first_state, next_state
 from envs.locomotion_tasks import TABLE, CostInputs
 from envs.registry import TASKS
 
@@ -85,12 +85,14 @@ class Locomotion:
 
     def reset_to(self, qpos: ArrayLike, qvel: ArrayLike) -> State:
         """Starts an episode at `qpos` `[nq]`, `qvel` `[nv]`."""
+        check_shape(f"{self.name}: qpos", qpos, (self.model.nq,))
+        check_shape(f"{self.name}: qvel", qvel, (self.model.nv,))
         data = self._physics.init(qpos, qvel)
         return first_state(data, self._observe(data), ("forward", "healthy", "control", "contact"))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. See `Environment.step`."""
-        action = jnp.clip(action, self.action_low, self.action_high)
+        action = executed(self, action)
         data = self._physics.step(state.physics, action)
         obs = self._observe(data)
         velocity, terms = self._terms(data, action)

@@ -51,7 +51,8 @@ class LocomotionTask:
 
 def _first_coordinate(model: mujoco.MjModel, data: Data) -> jax.Array:
     del model
-    return data.change["qpos"][:2] * jnp.array([1, 0])
+    change = data.change["qpos"]
+    return change[:2] * jnp.array([1.0, 0.0], change.dtype)
 
 
 def _first_two_coordinates(model: mujoco.MjModel, data: Data) -> jax.Array:

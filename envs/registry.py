@@ -1,7 +1,10 @@
 """The table of tasks. Imports no JAX, no engine: launchers read it to answer `--help` and to reject wrong names."""
 
 import dataclasses
-from collections.abc import Mapping
+import difflib
+import math
+import operator
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -69,3 +72,79 @@ _ROWS = (
     _safety_gym("DoggoButton1", (120, 12), _BUTTON),
 )
 TASKS: Mapping[str, TaskInfo] = MappingProxyType({task.name: task for task in _ROWS})
+
+
+def find_task(name: Any) -> TaskInfo:
+    """The description of a task.
+
+    Raises:
+        ValueError: there is no such task. The message names the one meant, as far as can be told: capitals are
+            ignored, and so are prefixes and versions of gymnasium and safety-gymnasium.
+    """
+    if isinstance(name, str) and name in TASKS:
+        return TASKS[name]
+    spellings = {spelling.casefold(): task.name for task in _ROWS for spelling in (task.name, task.original)}
+    raise ValueError(f"{name}: unknown task; {_hint(str(name), spellings)}choose one of {', '.join(TASKS)}")
+
+
+def check_options(task: TaskInfo, physics: Any, options: Mapping[str, Any]) -> None:
+    """Checks what `envs.make` was given besides the task.
+
+    Raises:
+        ValueError: the task has no such option, or not such a value.
+    """
+    if physics not in PHYSICS:
+        near = _hint(str(physics), {name: name for name in PHYSICS})
+        raise ValueError(f"{physics}: unknown physics; {near}choose one of {', '.join(PHYSICS)}")
+    known = {name: check for name, check in _CHECKS.items() if name in _COMMON_OPTIONS or name in task.options}
+    for name, value in options.items():
+        if name not in known:
+            near = _hint(name, {name: name for name in known})
+            raise ValueError(f"{task.name} has no option {name!r}; {near}its options are physics, {', '.join(known)}")
+        known[name](f"{task.name}: {name}", value)
+
+
+def check_count(what: str, value: Any) -> None:
+    """Refuses with a `ValueError` what is not a whole number from 1 to 2^31 - 1, the largest that JAX counts to."""
+    try:
+        sound = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
+    except TypeError:
+        sound = False
+    if not sound:
+        raise ValueError(f"{what} {value!r}: must be a whole number from 1 to 2147483647")
+
+
+def _check_threads(what: str, value: Any) -> None:
+    if value is not None:
+        check_count(what, value)
+
+
+def _check_threshold(what: str, value: Any) -> None:
+    try:
+        sound = value is None or (not isinstance(value, bool | str) and 0 <= float(value) < math.inf)
+    except TypeError:
+        sound = False
+    if not sound:
+        raise ValueError(f"{what} {value!r}: must be a finite number that is not negative, or None for the task's own")
+
+
+def _check_switch(what: str, value: Any) -> None:
+    if not isinstance(value, bool):
+        raise ValueError(f"{what} {value!r}: must be True or False")
+
+
+_COMMON_OPTIONS = ("max_episode_steps", "num_threads")  # of every task
+_CHECKS: Mapping[str, Callable[[str, Any], None]] = MappingProxyType(
+    {
+        "max_episode_steps": check_count,
+        "num_threads": _check_threads,
+        "cost_threshold": _check_threshold,
+        "contact_cost": _check_switch,
+    }
+)
+
+
+def _hint(name: str, spellings: Mapping[str, str]) -> str:
+    """A question that names what was probably meant, or nothing. Of equally near spellings it takes the first."""
+    near = difflib.get_close_matches(name.casefold(), spellings, n=1, cutoff=0.6)
+    return f"did you mean {spellings[near[0]]}? " if near else ""

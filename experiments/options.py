@@ -3,7 +3,6 @@
 import argparse
 import contextlib
 import dataclasses
-import difflib
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any
 
 from ccil_jax.config import CHOICES, PRESETS, Config, ConfigError, Use, validate
 from ccil_jax.methods import METHODS
+from envs import registry
 from envs.registry import PHYSICS, TASKS, TaskInfo
 from experiments.command_line import Parser, UsageError, boolean, integer, natural, positive
 
@@ -119,11 +119,10 @@ def find_task(name: str | None, option: str = "--env") -> TaskInfo:
     """The description of a task. Raises `UsageError` with the nearest name for an unknown one."""
     if name is None:
         raise UsageError(f"{option}: required; one of {', '.join(TASKS)}")
-    if name in TASKS:
-        return TASKS[name]
-    near = difflib.get_close_matches(name, TASKS, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]}? " if near else ""
-    raise UsageError(f"{option} {name}: unknown task; {hint}choose one of {', '.join(TASKS)}")
+    try:
+        return registry.find_task(name)
+    except ValueError as error:
+        raise UsageError(f"{option} {error}") from None
 
 
 def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:

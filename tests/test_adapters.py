@@ -1,6 +1,7 @@
 """Our tasks through gymnasium's and Brax's interfaces, and Brax's through ours."""
 
-from typing import Any
+import dataclasses
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -14,6 +15,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 import envs
 from envs.adapters import FromBrax, GymnasiumVectorEnv, to_brax
 from envs.testing import check_environment
+from tests.probe_envs import Walk
 
 NUM_ENVS = 3
 NUM_STEPS = 5
@@ -82,6 +84,49 @@ def test_step_before_reset_is_refused(vector_env: GymnasiumVectorEnv) -> None:
         vector_env.step(np.zeros((NUM_ENVS, 6), np.float32))
 
 
+@pytest.mark.parametrize("shape", [(), (6,), (NUM_ENVS,), (NUM_ENVS, 1), (1, 6), (NUM_ENVS, 5)])
+def test_actions_of_another_shape_are_refused(vector_env: GymnasiumVectorEnv, shape: tuple[int, ...]) -> None:
+    vector_env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"HalfCheetah: the actions must have shape \(3, 6\), but has"):
+        vector_env.step(np.zeros(shape, np.float32))
+
+
+@pytest.mark.parametrize("num_envs", [0, 1.5])
+def test_a_number_of_copies_that_is_none_is_refused(num_envs: Any) -> None:
+    with pytest.raises(ValueError, match=r"num_envs .*whole number"):
+        GymnasiumVectorEnv(None, num_envs)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class OfUnequalLength(Walk):
+    """`Walk` from a place that is seen again only in an episode of its own."""
+
+    max_episode_steps: int = 20
+
+
+def test_each_copy_goes_on_from_its_own_fresh_episode() -> None:
+    """Resets are computed only when some copy needs one; what the copies show is as if all were, at every step."""
+    env, size = OfUnequalLength(), 4
+    vector_env = GymnasiumVectorEnv(env, size)
+    key, reset_key = jax.random.split(jax.random.key(5))
+    state = jax.vmap(env.reset)(jax.random.split(reset_key, size))
+    obs, _ = vector_env.reset(seed=5)
+    np.testing.assert_array_equal(obs, state.obs)
+    ends = 0
+    for _ in range(30):
+        obs, _, terminated, truncated, _ = vector_env.step(np.full((size, 1), -1.0, np.float32))
+        last = jax.vmap(env.step)(state, jnp.full((size, 1), -1.0))
+        key, reset_key = jax.random.split(key)
+        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, size))
+        state = jax.tree.map(
+            lambda new, old, done=last.done: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh, last
+        )
+        np.testing.assert_allclose(obs, state.obs, atol=1e-6)
+        np.testing.assert_array_equal(terminated | truncated, last.done)
+        ends += int(last.done.sum())
+    assert size < ends < 30 * size
+
+
 @pytest.mark.filterwarnings("ignore")  # Brax's own deprecations
 def test_to_brax_in_braxs_training_wrappers() -> None:
     brax_envs = pytest.importorskip("brax.envs")
@@ -91,6 +136,8 @@ def test_to_brax_in_braxs_training_wrappers() -> None:
     env = to_brax(ours)
     assert isinstance(env, brax_envs.Env)
     assert (env.observation_size, env.action_size, env.backend) == (270, 17, "native")
+    with pytest.raises(ValueError, match=r"Humanoid: an action must have shape \(17,\), but has shape \(1,\)"):
+        jax.eval_shape(env.step, jax.eval_shape(env.reset, jax.random.key(0)), jnp.zeros(1))
     wrapped = training.wrap(env, episode_length=4)
     keys = jax.random.split(jax.random.PRNGKey(0), NUM_ENVS)  # Brax's wrappers take their shapes from raw keys
     state = jax.jit(wrapped.reset)(keys)
@@ -116,6 +163,124 @@ def test_from_brax_keeps_the_contract() -> None:
         assert bool(state.truncated) == expected
         assert state.cost == env.action_dim
     assert state.episode_cost == 2 * env.action_dim
+
+
+class Plain:
+    """An environment of Brax's form that shows, earns and ends with what it is given."""
+
+    observation_size: Any = 2
+    action_size: Any = 1
+    backend = "none"
+
+    def __init__(self, **shown: Any):
+        self.shown = {"obs": jnp.zeros(2), "reward": jnp.ones(()), "done": jnp.zeros(())} | shown
+
+    def reset(self, rng: jax.Array) -> Any:
+        del rng
+        return Shown(obs=jnp.zeros(2), reward=jnp.zeros(()), done=jnp.zeros(()))
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        del state, action
+        return Shown(**self.shown)
+
+
+class Shown(NamedTuple):
+    """What is read of a Brax state."""
+
+    obs: Any
+    reward: jax.Array
+    done: jax.Array
+
+
+def ones(*_: Any) -> jax.Array:
+    """A cost."""
+    return jnp.ones(())
+
+
+def from_plain(cost: Any = ones, **shown: Any) -> FromBrax:
+    return FromBrax(Plain(**shown), cost, name="plain")
+
+
+@pytest.mark.parametrize(
+    ("bad", "obs"),
+    [
+        ({"obs": jnp.array([jnp.nan, 3.0])}, [0.0, 3.0]),
+        ({"reward": jnp.array(-jnp.inf)}, [0.0, 0.0]),
+        ({"cost": lambda *_: jnp.array(jnp.nan)}, [0.0, 0.0]),
+        ({"cost": lambda *_: jnp.array(-jnp.inf)}, [0.0, 0.0]),
+    ],
+)
+def test_from_brax_ends_an_episode_where_a_number_is_not_finite(bad: dict[str, Any], obs: list[float]) -> None:
+    env = from_plain(**bad)
+    state = env.step(env.reset(jax.random.key(0)), jnp.zeros(1))
+    assert state.terminated
+    np.testing.assert_array_equal(state.obs, obs)
+    assert [float(x) for x in (state.reward, state.cost, state.episode_return, state.episode_cost)] == [0.0] * 4
+    assert np.isfinite(state.terms["reward"])
+    sound = from_plain().step(env.reset(jax.random.key(0)), jnp.zeros(1))
+    assert [float(x) for x in (sound.terminated, sound.reward, sound.cost)] == [0.0, 1.0, 1.0]
+
+
+def test_from_brax_hides_no_negative_cost() -> None:
+    env = from_plain(lambda *_: jnp.array(-0.5))
+    start = env.reset(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"plain: the cost function returned -0\.5"):
+        env.step(start, jnp.zeros(1))
+    compiled = jax.jit(env.step)(start, jnp.zeros(1))
+    assert np.isnan(compiled.cost)
+    assert np.isnan(compiled.episode_cost)
+
+
+@pytest.mark.parametrize(
+    ("shown", "message"),
+    [
+        ({"reward": jnp.zeros(1)}, r"plain: reward must have shape \(\), but has shape \(1,\)"),
+        ({"cost": lambda *_: jnp.zeros(1)}, r"plain: cost must have shape \(\)"),
+        ({"done": jnp.zeros(1)}, r"plain: done must have shape \(\)"),
+        ({"obs": jnp.zeros((2, 1))}, r"plain: an observation must have shape \(2,\)"),
+    ],
+)
+def test_from_brax_refuses_other_shapes(shown: dict[str, Any], message: str) -> None:
+    env = from_plain(**shown)
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(env.step, env.reset(jax.random.key(0)), jnp.zeros(1))
+    with pytest.raises(ValueError, match="plain: an action"):
+        env.step(env.reset(jax.random.key(0)), jnp.zeros(()))
+
+
+def test_from_brax_shows_one_of_several_observations() -> None:
+    class Several(Plain):
+        observation_size: Any = {"state": (2,), "privileged_state": (5,)}  # noqa: RUF012
+
+        def reset(self, rng: jax.Array) -> Any:
+            return super().reset(rng)._replace(obs={"state": jnp.ones(2), "privileged_state": jnp.zeros(5)})
+
+    env = FromBrax(Several(), ones, name="several", obs_key="state")
+    assert env.obs_dim == 2
+    np.testing.assert_array_equal(env.reset(jax.random.key(0)).obs, np.ones(2))
+    for key in (None, "pixels"):
+        with pytest.raises(ValueError, match=r"has observations 'state', 'privileged_state'; choose one .* obs_key"):
+            FromBrax(Several(), ones, name="several", obs_key=key)
+    with pytest.raises(ValueError, match="leave obs_key 'state' out"):
+        FromBrax(Plain(), ones, name="plain", obs_key="state")
+
+
+@pytest.mark.parametrize("size", [(64, 64, 3), "2", None, 1.5, ()])
+def test_from_brax_refuses_what_is_no_row_of_numbers(size: Any) -> None:
+    for field, what in (("observation_size", "an observation"), ("action_size", "an action")):
+        with pytest.raises(ValueError, match=f"plain: {what} must be one row of numbers"):
+            FromBrax(type("Odd", (Plain,), {field: size})(), ones, name="plain")
+    env = FromBrax(type("Shaped", (Plain,), {"observation_size": (2,)})(), ones, name="plain")
+    assert env.obs_dim == 2
+
+
+@pytest.mark.filterwarnings("ignore")  # Brax's own deprecations
+def test_from_brax_refuses_wrappers_that_hide_the_end_of_an_episode() -> None:
+    brax_envs = pytest.importorskip("brax.envs")
+    wrapped = brax_envs.create("fast", episode_length=5)  # as Brax itself wraps what it makes
+    with pytest.raises(ValueError, match=r"wrapped in AutoResetWrapper, EpisodeWrapper, .*env\.unwrapped"):
+        FromBrax(wrapped, ones, name="fast")
+    assert FromBrax(wrapped.unwrapped, ones, name="fast").obs_dim == wrapped.observation_size
 
 
 @pytest.mark.slow

@@ -39,6 +39,7 @@ ORDER = (
     "networks",
     "running_statistics",
     "shuffling",
+    "optimizers",
     "returns",
     "demonstrations",
     "rollout",
@@ -205,6 +206,18 @@ def python(code: str, **environment: str) -> str:
 def test_importing_imports_no_heavy_package(name: str) -> None:
     heavy = ("jax", "jaxlib", "flax", "optax", "orbax", "brax", "mujoco", "matplotlib", "gymnasium")
     assert python(f"import sys, {name}; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"
+
+
+def test_only_those_who_ask_for_it_pay_for_brax() -> None:
+    """Brax brings a web server along."""
+    modules = sorted(SOURCES.keys() - FOREIGN - {"envs.physics.warp_patch"})
+    found = python(
+        "import importlib, sys, envs\n"
+        f"for name in {modules}: importlib.import_module(name)\n"
+        "envs.make('Swimmer', physics='native'), envs.make('Swimmer', physics='mjx')\n"
+        "print([name for name in ('brax', 'flask') if name in sys.modules])"
+    )
+    assert found.splitlines()[-1] == "[]"
 
 
 def test_everything_can_be_imported_where_jax_has_no_device() -> None:

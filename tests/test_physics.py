@@ -1,5 +1,6 @@
 """The physics backends: bits, purity, vmapping, divergence, and MJX against C MuJoCo."""
 
+import errno
 import importlib.util
 import os
 import subprocess
@@ -12,8 +13,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numba
 import numpy as np
 import pytest
+from numba.core import caching
 
 from envs.base import full_precision
 from envs.locomotion import load_model
@@ -431,3 +434,30 @@ def test_warp_without_its_package_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 def test_importing_envs_imports_neither_jax_nor_an_engine() -> None:
     program = "import sys, envs; bad = {'jax', 'mujoco', 'gymnasium', 'brax'} & set(sys.modules); assert not bad, bad"
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+# Numba's files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", ["no folder", "no room"])
+def test_code_is_compiled_where_it_cannot_be_kept(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if fault == "no folder":
+        monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
+        monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "")
+    else:
+        monkeypatch.setattr(caching.IndexDataCacheFile, "load", fail)
+        monkeypatch.setattr(caching.IndexDataCacheFile, "save", fail)
+
+    @foreign._compiled
+    def double(x: Any) -> Any:
+        return 2 * x
+
+    @foreign._called_by_c(numba.types.int64(numba.types.int64))
+    def double_and_one(x: Any) -> Any:
+        return double(x) + 1
+
+    assert double(4) == 8
+    assert double_and_one.ctypes(4) == 9

@@ -8,6 +8,7 @@ every process. What is not, the address of an engine, stands in a table under th
 `engine.Engine` makes engines and calls these functions in a jitted program.
 """
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,6 +18,7 @@ import mujoco
 import numba
 import numpy as np
 from numba import types
+from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
 STEP, FORWARD = "ccil_jax_mujoco_step", "ccil_jax_mujoco_forward"
@@ -77,13 +79,35 @@ llvmlite.binding.add_symbol("ccil_jax_engines", _getter.address)
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+class _Cache(FunctionCache):
+    """Numba's files of compiled code, as a convenience: where they cannot be read or written, code is compiled anew."""
+
+    def load_overload(self, *args: Any) -> Any:
+        """What a file has of a function, or None."""
+        with contextlib.suppress(OSError):
+            return super().load_overload(*args)
+        return None
+
+    def save_overload(self, *args: Any) -> None:
+        """Writes a function's code to a file, if there is room."""
+        with contextlib.suppress(OSError):
+            super().save_overload(*args)
+
+
 def _compiled(function: _Function) -> _Function:
-    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    with contextlib.suppress(RuntimeError):  # numba finds no folder that can be written
+        compiled._cache = _Cache(function)
     return compiled
 
 
 def _called_by_c(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    decorate: Any = numba.cfunc(signature, cache=True)
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.cfunc(signature, cache=True)(function)
+        except (RuntimeError, OSError):  # no folder that can be written, or no room in it
+            return numba.cfunc(signature)(function)
+
     return decorate
 
 

@@ -15,7 +15,7 @@ import mujoco
 from flax import struct
 from jax.typing import ArrayLike
 
-from envs.base import full_precision
+from envs.base import full_precision, usual_rules
 from envs.physics.base import Data, Mocap
 from envs.physics.mjx_patch import align_plane_capsule_frames, searches_that_end
 
@@ -94,6 +94,7 @@ class MjxPhysics:
         self._fields, self._track = tuple(fields), tuple(track)
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in ("qpos", "qvel")))
 
+    @usual_rules
     @full_precision
     @searches_that_end()
     def init(self, qpos: ArrayLike, qvel: ArrayLike, mocap: Mocap | None = None) -> Data:
@@ -107,6 +108,7 @@ class MjxPhysics:
             data = self._mjx.forward(self._model, data).replace(qpos=data.qpos)
         return self._pack(data, {n: jnp.zeros_like(read(data, n)) for n in self._track})
 
+    @usual_rules
     @full_precision
     @searches_that_end()
     def step(self, data: Data, ctrl: ArrayLike, mocap: Mocap | None = None) -> Data:

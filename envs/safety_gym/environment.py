@@ -10,7 +10,7 @@ from jax.scipy.spatial.transform import Rotation
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
-from envs.base import State, compute_where, first_state, next_state
+from envs.base import State, check_shape, compute_where, executed, first_state, next_state
 from envs.physics import Mocap
 from envs.safety_gym import layout as layouts
 from envs.safety_gym import scene as scenes
@@ -120,11 +120,15 @@ class SafetyGym:
             ticks: `[]` int, engine steps since the episode began.
             key: of the goals to come; consumed. By default that of seed 0.
         """
+        check_shape(f"{self.name}: layout", layout, (len(self._radii), 2))
+        check_shape(f"{self.name}: qpos", qpos, (self.model.nq,))
+        check_shape(f"{self.name}: qvel", qvel, (self.model.nv,))
         layout = jnp.asarray(layout, jnp.result_type(float))
         if self.task.aim == "button":
             layout = self._with_goal(layout, layout[self._places["buttons"]][goal_button])
         if mocap_quat is None:
             mocap_quat = jnp.zeros((self.model.nmocap, 4)).at[:, 0].set(1.0)
+        check_shape(f"{self.name}: mocap_quat", mocap_quat, (self.model.nmocap, 4))
         mocap_quat = jnp.asarray(mocap_quat, layout.dtype)
         ticks = jnp.asarray(ticks, jnp.int32)
         mocap = Mocap(pos=self._mocap_path(layout, ticks)[0], quat=mocap_quat) if self.model.nmocap else None
@@ -145,7 +149,7 @@ class SafetyGym:
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. See `Environment.step`."""
         aim, world = AIMS[self.task.aim], state.physics
-        world = self._advance(world, jnp.clip(action, self.action_low, self.action_high))
+        world = self._advance(world, executed(self, action))
         situation = self.situation(world)
         distances, met = aim.distances(situation), aim.met(situation)
         terms = {name: world.distances[name] - distances[name] for name in distances}
@@ -221,12 +225,13 @@ class SafetyGym:
 
     def _mocap_path(self, layout: jax.Array, ticks: jax.Array) -> jax.Array:
         """[SUBSTEPS, num_mocap, 3]: where the mocap bodies are in each of the substeps from `ticks` on."""
-        angle = (ticks + jnp.arange(scenes.SUBSTEPS)) * self.model.opt.timestep
+        seconds = (ticks + jnp.arange(scenes.SUBSTEPS, dtype=ticks.dtype)).astype(layout.dtype)
+        angle = seconds * self.model.opt.timestep
         course = CIRCLE * jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=1)
         path = jnp.zeros((scenes.SUBSTEPS, self.model.nmocap, 3), layout.dtype)
         for name, rows in self.scene.mocap.items():
             kind, centres = self._kinds[name], layout[self._places[name]]
-            places = centres + course[:, None] if kind.circling else centres
+            places = centres[None] + course[:, None] if kind.circling else centres[None]
             path = path.at[:, rows, :2].set(places).at[:, rows, 2].set(FLIGHT if kind.circling else kind.height)
         return path
 

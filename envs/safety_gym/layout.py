@@ -48,7 +48,7 @@ def is_clear(
 ) -> Bool[Array, " C"]:
     """Which points are at least the sum of both keepouts away from all others."""
     distance = jnp.linalg.norm(points[:, None] - others[None], axis=-1)
-    return (distance >= keepout + jnp.asarray(other_keepouts)).all(axis=1)
+    return (distance >= (keepout + jnp.asarray(other_keepouts))[None]).all(axis=1)
 
 
 def first_clear(points: Float[Array, "C 2"], clear: Bool[Array, " C"]) -> tuple[Float[Array, "2"], Bool[Array, ""]]:
@@ -91,7 +91,7 @@ def from_bank(key: jax.Array) -> Float[Array, "P 2"]:
     row_key, image_key = jax.random.split(key)
     layout = jnp.asarray(bank)[jax.random.randint(row_key, (), 0, len(bank))]
     flips = jax.random.randint(image_key, (3,), 0, 2)
-    signs = 1.0 - 2.0 * flips[:2]
+    signs = 1.0 - 2.0 * flips[None, :2].astype(layout.dtype)
     return signs * jnp.where(flips[2] == 0, layout, layout[:, ::-1])
 
 

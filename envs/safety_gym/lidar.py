@@ -24,13 +24,14 @@ def lidar(
         points: K objects' positions on the floor, m.
     """
     on_floor = jnp.concatenate([points, jnp.zeros_like(points[:, :1])], axis=1)
-    seen = ((on_floor - robot_pos) @ robot_mat)[:, :2]
+    seen = ((on_floor - robot_pos[None]) @ robot_mat)[:, :2]
     closeness = jnp.maximum(0.0, RANGE - jnp.linalg.norm(seen, axis=1)) / RANGE
     angle = jnp.arctan2(seen[:, 1], seen[:, 0]) % (2 * math.pi)
     place = angle / (2 * math.pi / NUM_BINS)
     first = jnp.floor(place)
-    past = place - first
+    past = (place - first)[None]
     bins = first.astype(jnp.int32) % NUM_BINS  # rounding can make an angle of just below 0 into 2 pi
-    ahead = (jnp.arange(NUM_BINS)[:, None] - bins) % NUM_BINS  # [16, K]: how many bins further round than the object's
+    further = jnp.arange(NUM_BINS)[:, None] - bins[None]
+    ahead = further % NUM_BINS  # [16, K]: how many bins further round than the object's
     parts = jnp.select([ahead == 0, ahead == 1, ahead == NUM_BINS - 1], [1.0, past, 1 - past], 0.0)
-    return (parts * closeness).max(axis=1)
+    return (parts * closeness[None]).max(axis=1)

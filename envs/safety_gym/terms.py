@@ -59,7 +59,7 @@ AIMS = {
 
 
 def _over_hazard(x: Situation) -> jax.Array:
-    offset = x.objects["hazards"][:, :2] - x.robot[:2]
+    offset = x.objects["hazards"][:, :2] - x.robot[None, :2]
     return (jnp.sqrt(jnp.sum(jnp.square(offset), axis=1)) < x.sizes["hazards"]).any()
 
 
