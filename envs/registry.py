@@ -25,13 +25,17 @@ class TaskInfo:
     cost: str  # what costs 1 in a step, in words
 
 
-def _locomotion(name: str, dims: tuple[int, int], cost_threshold: float, cost_limit: float, quantity: str) -> TaskInfo:
+def _locomotion(
+    name: str, dims: tuple[int, int], cost_threshold: float, cost_limit: float, quantity: str, *, contact: bool = False
+) -> TaskInfo:
+    """A row; `contact` says that the cost counts contacts, so that there is a choice to leave them out."""
+    contact_cost = {"contact_cost": True} if contact else {}
     return TaskInfo(
         name=name,
         family="locomotion",
         obs_dim=dims[0],
         action_dim=dims[1],
-        options=MappingProxyType({"cost_threshold": cost_threshold, "contact_cost": True}),
+        options=MappingProxyType({"cost_threshold": cost_threshold, **contact_cost}),
         cost_limit=cost_limit,
         original=f"{name}-v5",
         cost=f"{quantity} > {cost_threshold:g}",
@@ -60,8 +64,8 @@ _ROWS = (
     _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
     _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
     _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
-    _locomotion("Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost"),
-    _locomotion("Humanoid", (270, 17), 0.2, 40.0, "0.1 * sum of squared actions + contact cost"),
+    _locomotion("Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost", contact=True),
+    _locomotion("Humanoid", (270, 17), 0.2, 40.0, "0.1 * sum of squared actions + contact cost", contact=True),
     _safety_gym("PointGoal1", (60, 2), _HAZARD),
     _safety_gym("PointButton1", (76, 2), _BUTTON),
     _safety_gym("PointPush1", (76, 2), _HAZARD),

@@ -181,7 +181,7 @@ def evaluate_run(
     if arguments.simulator == "ours":
         evaluated: Any = evaluation.evaluate(loaded.config, loaded.agent, env, **settings)
     else:
-        contact_cost = stored.facts["env_options"]["contact_cost"]
+        contact_cost = stored.facts["env_options"].get("contact_cost", True)
         evaluated = original.evaluate(loaded.config, loaded.agent, env, contact_cost=contact_cost, **settings)
     facts = {
         "task": env.name,

@@ -18,6 +18,7 @@ import numpy as np
 
 from ccil_jax.config import Config
 from ccil_jax.versions import versions
+from envs.registry import TASKS
 from experiments.command_line import UsageError, command
 from experiments.statistics import known_mean
 
@@ -116,6 +117,10 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
         raise UsageError(f"{path}: keys are missing; give a folder that this version's `train` or `expert` wrote")
     if unknown := sorted(set(fields) - names):
         raise UsageError(f"{path}: field '{unknown[0]}' is not known to this version; use the version that wrote it")
+    task = TASKS.get(str(facts["task"]))
+    if task:  # an earlier version wrote options that make no difference to the task
+        known = {*task.options, "max_episode_steps"}
+        facts["env_options"] = {name: value for name, value in facts["env_options"].items() if name in known}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
     return Run(path.parent, Config(**values), facts)
 

@@ -93,6 +93,7 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "stray word": ((*TRAIN, "Swimmer"), "Swimmer: unknown; see --help"),
     "not a number": ((*TRAIN, "--gamma", "high"), "--gamma: invalid float value: 'high'"),
     "not an integer": ((*TRAIN, "--num_envs", "1.5"), "--num-envs: invalid integer value: '1.5'"),
+    "a task without contacts": ((*TRAIN, "--contact-cost", "false"), "--contact-cost: Swimmer has no such option"),
     "not a boolean": ((*TRAIN, "--contact-cost", "maybe"), "--contact-cost: 'maybe': give true or false"),
     "not sizes": ((*TRAIN, "--hidden-sizes", "a,b"), "--hidden-sizes: 'a,b': give sizes such as 100,100"),
     "not a limit": ((*TRAIN, "--cost-limit", "low"), "--cost-limit: 'low': give a number or none"),

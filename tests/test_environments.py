@@ -90,6 +90,7 @@ def test_nothing_is_guessed_where_nothing_is_near() -> None:
         *(("Swimmer", {"num_threads": value}, "num_threads .*whole number") for value in (0, 1.5)),
         *(("Swimmer", {"cost_threshold": value}, "cost_threshold .*finite") for value in (-1, float("nan"), "1", [1])),
         ("Ant", {"contact_cost": "no"}, "True or False"),
+        ("Swimmer", {"contact_cost": False}, "Swimmer has no option 'contact_cost'"),  # its cost counts no contacts
         ("Ant", {"physics": ["native"]}, "unknown physics"),
     ],
 )
