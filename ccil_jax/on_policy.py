@@ -103,6 +103,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             key=key,
         )
 
+    @jax.jit  # so that its shapes and the loop over it take one trace
     def generator_step(state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
         rollout_key, split_key, critic_key = jax.random.split(key, 3)
         rollout_state, transition = rollout.rollout(

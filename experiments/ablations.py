@@ -126,7 +126,8 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
     configs = {key: _config(fields, QUESTIONS[key[0]].answers[key[1]], QUESTIONS[key[0]].method) for key in chosen}
     idle = {key: set(unused(config)) for key, config in configs.items()}
     with options.errors_name_options():
-        check_used(configs[chosen[0]], shared.keys() & set.intersection(*idle.values()))
+        in_vain = {name: shared[name] for name in shared if all(name in unused_here for unused_here in idle.values())}
+        check_used(configs[chosen[0]].replace(**in_vain), in_vain)
     load = functools.cache(load_demonstrations)
     for name, answer in chosen:
         question = QUESTIONS[name]

@@ -202,7 +202,7 @@ def test_the_policy_step_sees_observations_normalised_as_when_the_actions_were_d
         return params, (), {"shift": jnp.max(jnp.abs(apply(params, batch.obs).mean - batch.action))}
 
     monkeypatch.setattr(policy_step, "improve", improve)
-    agent = on_policy.make(walk_config(method="trpo", cost_limit=0.0, generator_steps=3), Walk(), None)
+    agent = on_policy.make(walk_config(method="trpo", generator_steps=3), Walk(), None)
     with quick_compilation():
         state = jax.jit(agent.init)(jax.random.key(0))
         rng = np.random.default_rng(0)

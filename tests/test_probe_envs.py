@@ -64,25 +64,25 @@ COST_LIMIT = (1 + DEVIATION**2) / 2
 
 
 def train_on_conflict(**changes: Any) -> Result:
-    config = Config(
-        method="expert",
-        cost_limit=COST_LIMIT,
-        policy_entropy_coefficient=ENTROPY_COEFFICIENT,
-        env_steps=500 * 512,
-        num_envs=512,
-        batch_size=512,
-        generator_steps=1,
-        hidden_sizes=(4,),
-        fisher_stride=16,
-        max_kl=1e-3,
-        critic_epochs=1,
-        critic_learning_rate=0.01,
-        multiplier_update="sgd",
-        initial_multiplier=0.0,
-        multiplier_learning_rate=0.1,
-    )
+    base = {
+        "method": "expert",
+        "cost_limit": COST_LIMIT,
+        "policy_entropy_coefficient": ENTROPY_COEFFICIENT,
+        "env_steps": 500 * 512,
+        "num_envs": 512,
+        "batch_size": 512,
+        "generator_steps": 1,
+        "hidden_sizes": (4,),
+        "fisher_stride": 16,
+        "max_kl": 1e-3,
+        "critic_epochs": 1,
+        "critic_learning_rate": 0.01,
+        "multiplier_update": "sgd",
+        "initial_multiplier": 0.0,
+        "multiplier_learning_rate": 0.1,
+    }
     with quick_compilation():
-        return runner.train(config.replace(**changes), Conflict(), num_seeds=3)
+        return runner.train(Config.from_base(base, changes), Conflict(), num_seeds=3)
 
 
 def check_settled(result: Result) -> None:

@@ -210,7 +210,7 @@ def test_devices_share_runs_without_a_word(method: str) -> None:
 def test_a_chunk_of_iterations_stays_on_its_device() -> None:
     """A compiled iteration over MJX physics does not speak to the host, and what it needs is refused from there."""
     env = envs.make("Swimmer", physics="mjx")
-    small = runner.resolve(walk_config(method="trpo", cost_limit=None), env, None)
+    small = runner.resolve(walk_config(method="trpo"), env, None)
     with quick_compilation():
         program = compile_program(small, env, None, 1)
     calls = set(re.findall(r'custom_call_target="([^"]+)"', program.text()))

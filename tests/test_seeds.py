@@ -140,7 +140,7 @@ def test_every_random_key_is_consumed_once() -> None:
 @pytest.mark.parametrize("regularizer", ["gradient_penalty", "spectral_norm"])
 def test_no_seed_waits_for_anothers_thread(regularizer: str) -> None:
     """Batched LAPACK kernels on the CPU wait for helpers from the pool that they occupy; with few threads, for ever."""
-    config, env = walk_config(method="malm", cost_limit=1.0, discriminator_regularizer=regularizer), Walk()
+    config, env = walk_config(method="malm", discriminator_regularizer=regularizer).replace(cost_limit=1.0), Walk()
     expert = runner.expert_data(walk_demonstrations())
     agent = on_policy.make(config, env, expert)
     init = str(jax.make_jaxpr(jax.vmap(agent.init))(jax.random.split(jax.random.key(0), 2)))

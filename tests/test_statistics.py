@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccil_jax.config import METHOD_NAMES, Config
 from ccil_jax.demonstrations import Demonstrations
 from experiments import summary
 from experiments.statistics import Interval, bootstrap_interval, interquartile_mean, known_deviation, known_mean
@@ -211,10 +210,3 @@ def test_the_table_shows_errors_marks_and_no_interval_of_two_seeds(capsys: pytes
     assert lines["random policy"] == ["1.00 +- -", "2.00 +- -", "-", ""]  # without an expert there is no scale
     assert lines["cost limit"] == ["", "20.00", "", ""]
     assert lines["seed 1"][2:] == ["-", "1.60"]
-
-
-def test_methods_with_a_multiplier() -> None:
-    assert {name for name in METHOD_NAMES if summary.has_multiplier(Config(method=name))} == {
-        *("malm", "ccil", "lgail", "expert", "pid_il")
-    }
-    assert not summary.has_multiplier(Config(method="ccil", multiplier_update="optimal"))

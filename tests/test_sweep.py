@@ -140,12 +140,12 @@ def test_a_byte_order_mark_does_not_matter_and_other_encodings_are_named(tmp_pat
 
 
 def test_static_fields_make_programs_and_traced_fields_share_them(tmp_path: Path) -> None:
-    grid = {**GRID, "max_kl": [0.01, 0.02, 0.05], "method": ["trpo", "expert"], "seed": [0, 1]}
-    spec = {"env": "Swimmer", "fixed": FIXED, "grid": grid}
+    grid = {**GRID, "max_kl": [0.01, 0.02, 0.05], "multiplier_update": ["adam", "sgd"], "seed": [0, 1]}
+    spec = {"env": "Swimmer", "method": "expert", "fixed": FIXED, "grid": grid}
     found = sweep.variants_of(tmp_path / "s.json", spec, tmp_path)
     assert len(found) == 2 * 2 * 3 * 2 * 2
     programs = variants.group([variant for variant, _ in found.values()], tmp_path)
-    assert [len(program.variants) for program in programs] == [2 * 3] * (2 * 2 * 2)  # sizes, methods, base seeds
+    assert [len(program.variants) for program in programs] == [2 * 3] * (2 * 2 * 2)  # sizes, dual steps, base seeds
     assert len({program.folder for program in programs}) == 8
 
 
