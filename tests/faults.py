@@ -30,11 +30,28 @@ ROOT = Path(__file__).parent.parent
 METHODS: tuple[str, ...] = ("malm", "ccil", "gail", "expert", "bc", "iq_learn")
 NUM_ITERATIONS = 40
 SECONDS_TO_LEAVE = 30.0
-OPTIONS = (
-    f"--env Walk --env-steps {NUM_ITERATIONS * 64} --num-seeds 2 --seed 3 --eval-episodes 2 --max-episode-steps 7 "
-    "--num-envs 4 --batch-size 32 --generator-steps 2 --hidden-sizes 4 --discriminator-minibatch-size 16 "
-    f"--critic-minibatch-size 8 --critic-epochs 2 --fisher-stride 2 --bc-epochs {NUM_ITERATIONS}"
-).split()
+RUN = "--env Walk --num-seeds 2 --seed 3 --eval-episodes 2 --max-episode-steps 7".split()
+FIELDS = {  # each method gets those that it uses
+    "env_steps": NUM_ITERATIONS * 64,
+    "num_envs": 4,
+    "batch_size": 32,
+    "generator_steps": 2,
+    "hidden_sizes": 4,
+    "discriminator_minibatch_size": 16,
+    "critic_minibatch_size": 8,
+    "critic_epochs": 2,
+    "fisher_stride": 2,
+    "bc_epochs": NUM_ITERATIONS,
+}
+
+
+def options(method: str) -> list[str]:
+    """What `train` is given, but for demonstrations and folder."""
+    from ccil_jax.config import Config, unused
+
+    idle = unused(Config(method=method))
+    used = {name: value for name, value in FIELDS.items() if name not in idle}
+    return [*RUN, "--method", method, *(f"--{name.replace('_', '-')}={value}" for name, value in used.items())]
 
 
 @dataclasses.dataclass
@@ -99,7 +116,7 @@ class Suite:
         demos = ["--cost-limit", "1"] if method == "expert" else ["--demos", str(self.scratch / "walk.npz")]
         resume = ["--resume"] if (folder / "config.json").is_file() else []
         launcher = [sys.executable, __file__, "--child", "train"]
-        command = [*prefix, *launcher, "--method", method, "--out", str(folder), *OPTIONS, *demos, *resume, *more]
+        command = [*prefix, *launcher, *options(method), "--out", str(folder), *demos, *resume, *more]
         environment = {**self.environment(), **variables}
         return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 

@@ -68,7 +68,7 @@ def test_long_runs_do_not_grow(num_iterations: int, tmp_path: Path, monkeypatch:
     jax.monitoring.register_event_duration_secs_listener(on_compilation)
     try:
         with quick_compilation():
-            config = walk_config(method="trpo", env_steps=num_iterations * 64, cost_limit=0.0)
+            config = walk_config(method="trpo", env_steps=num_iterations * 64)
             result = runner.train(config, Walk(), num_seeds=2, checkpoint_dir=tmp_path, on_progress=on_progress)
     finally:
         jax.monitoring.unregister_event_duration_listener(on_compilation)
