@@ -110,10 +110,10 @@ def expert_data(demonstrations: Demonstrations | None) -> ExpertData | None:
     num_training = max(1, demonstrations.obs.shape[0] * 9 // 10)
     held_out = slice(min(num_training, demonstrations.obs.shape[0] - 1), None)
     return ExpertData(
-        obs=jnp.asarray(demonstrations.obs[:num_training]),
-        action=jnp.asarray(demonstrations.actions[:num_training]),
-        held_out_obs=jnp.asarray(demonstrations.obs[held_out]),
-        held_out_action=jnp.asarray(demonstrations.actions[held_out]),
+        obs=_real(demonstrations.obs[:num_training]),
+        action=_real(demonstrations.actions[:num_training]),
+        held_out_obs=_real(demonstrations.obs[held_out]),
+        held_out_action=_real(demonstrations.actions[held_out]),
         transitions=expert_transitions(demonstrations),
     )
 
@@ -125,12 +125,17 @@ def expert_transitions(demonstrations: Demonstrations) -> ExpertTransitions:
     last[ends - 1] = True
     known = np.flatnonzero(~last | demonstrations.terminated)
     return ExpertTransitions(
-        obs=jnp.asarray(obs[known]),
-        action=jnp.asarray(demonstrations.actions[known]),
-        next_obs=jnp.asarray(obs[np.minimum(known + 1, len(obs) - 1)]),
-        terminated=jnp.asarray(demonstrations.terminated[known], jnp.result_type(float)),
-        initial_obs=jnp.asarray(obs[np.concatenate([[0], ends[:-1]])]),
+        obs=_real(obs[known]),
+        action=_real(demonstrations.actions[known]),
+        next_obs=_real(obs[np.minimum(known + 1, len(obs) - 1)]),
+        terminated=_real(demonstrations.terminated[known]),
+        initial_obs=_real(obs[np.concatenate([[0], ends[:-1]])]),
     )
+
+
+def _real(values: np.ndarray) -> jax.Array:
+    """As a device array of JAX's real numbers: float32, or float64 where the user has asked for that."""
+    return jnp.asarray(values, jnp.result_type(float))
 
 
 def train(

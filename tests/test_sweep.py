@@ -225,7 +225,10 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
     assert all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
     checkpoints_agree_with_metrics(out)
 
-    for changes, message in (({"env": "HalfCheetah"}, "--resume: env is 'HalfCheetah'"), ({"fixed": FIXED | {"seed": 1}}, "")):
+    for changes, message in (
+        ({"env": "HalfCheetah"}, "--resume: env is 'HalfCheetah'"),
+        ({"fixed": FIXED | {"seed": 1}}, ""),
+    ):
         with pytest.raises(SystemExit):
             sweep.main([str(write_spec(tmp_path, "other.json", **changes)), "--out", str(out), "--resume"])
         assert message in capsys.readouterr().err
