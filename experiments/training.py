@@ -44,13 +44,6 @@ class Plan:
     moved: tuple[str, ...] = ()  # fields of `config` that are not those of the training that is resumed
 
     @property
-    def cost_limit(self) -> float | None:
-        """What episode costs are shown against: the limit of the method, else J_E of the demonstrations, if known."""
-        if self.config.cost_limit is not None or self.demonstrations is None:
-            return self.config.cost_limit
-        return self.demonstrations.mean_episode_cost
-
-    @property
     def evaluation_seed(self) -> int:
         """Seed of the evaluation episodes."""
         return (self.seed + _EVALUATION_SEED_OFFSET) % 2**32
@@ -101,7 +94,7 @@ def execute_together(
         Display(
             title,
             first.config.num_iterations,
-            first.cost_limit,
+            first.config.cost_limit,
             has_multiplier=first.config.has_multiplier,
         ) as display,
         Interruption() as interruption,
