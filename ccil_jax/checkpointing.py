@@ -6,6 +6,7 @@ Orbax commits a step by renaming a folder, so that a killed process leaves none 
 
 import contextlib
 import errno
+import itertools
 import logging
 import os
 import shutil
@@ -97,8 +98,9 @@ class Checkpointer:
     def _set_aside(self, folder: Path, suffix: str) -> None:
         if self._readonly:
             return
-        target = folder.with_name(f"{folder.name}.{suffix}")
-        shutil.rmtree(target, ignore_errors=True)
+        target, count = folder.with_name(f"{folder.name}.{suffix}"), itertools.count(2)
+        while target.exists():
+            target = folder.with_name(f"{folder.name}.{suffix}-{next(count)}")
         folder.rename(target)
         self._manager.reload()
 
@@ -118,7 +120,7 @@ class Checkpointer:
     def replace(self, step: int, state: PyTree) -> None:
         """Saves as `save` does what another training may have saved here before.
 
-        A step that holds the same arrays stays as it is; all others are set aside under the name `N.replaced`.
+        A step that holds the same arrays stays as it is; all others are set aside as `N.replaced`, `N.replaced-2`, ...
         """
         folder = self._directory / str(step)
         with contextlib.suppress(DamageError):

@@ -31,6 +31,8 @@ def run(arguments: argparse.Namespace) -> None:
         os.sched_setaffinity(0, arguments.cpus)
     program = variants.read_program(arguments.program)
     finished = {variant.plan.folder for variant in program.variants if variant.finished}
+    if len(finished) == len(program.variants):
+        return  # a worker before this one died when everything was done
     plans = [variant.plan for variant in program.variants]
     execute_together(plans, program.folder / "checkpoints", resume=True, finished=finished)
 

@@ -243,6 +243,9 @@ def test_what_is_replaced_is_set_aside_whole(folder: Path) -> None:
         assert same_bits(checkpoints.restore(2, shapes(state(0))), state(7))
     assert (folder / "3.replaced" / digests.NAME).read_bytes() == before
     digests.read(folder / "2.replaced")
+    with Checkpointer(folder, IDENTITY) as checkpoints:
+        checkpoints.replace(2, state(8))  # what was set aside before stays too
+    assert sorted(path.name for path in folder.iterdir()) == ["2", "2.replaced", "2.replaced-2", "3.replaced"]
 
 
 def test_a_full_disk_ends_the_run_now(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

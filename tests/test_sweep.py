@@ -16,7 +16,7 @@ import pytest
 import envs
 from ccil_jax import digests, runner
 from ccil_jax.demonstrations import Demonstrations, save_demonstrations
-from experiments import run_folder, sweep, variants, workers
+from experiments import run_folder, sweep, sweep_worker, variants, workers
 from experiments.command_line import UsageError
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config
 from tests.processes import command_lines, in_proc
@@ -219,6 +219,10 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
     assert sweep.main([str(spec), "--out", str(out), "--resume"]) == 0
     assert "in 2 programs, 1 of them unfinished" in capsys.readouterr().out
     assert (folder / "summary.json").exists()
+    program = next(iter(out.glob("programs/*")))
+    log = (program / "worker.log").read_text()
+    assert sweep_worker.main([str(program)]) == 0  # nothing is left to do
+    assert (program / "worker.log").read_text() == log
     assert {path: path.stat().st_mtime_ns for path in others} == others
     assert sorted(path.name for path in (folder / "checkpoints").glob("[0-9]*")) == ["2"]
     after = run_folder.read_metrics(folder)
