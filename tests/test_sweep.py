@@ -340,8 +340,8 @@ def test_a_program_that_fails_is_reported(tmp_path: Path) -> None:
 
 
 def small_program(out: Path) -> Path:
-    fields = {**SPEC["fixed"], "env": "Swimmer", "method": "trpo", "hidden_sizes": [4]}
-    (program,) = variants.group([variants.make_variant("trpo", fields, out)], out)
+    fields = {**SPEC["fixed"], "env": "Swimmer", "method": "expert", "hidden_sizes": [4]}
+    (program,) = variants.group([variants.make_variant("expert", fields, out)], out)
     variants.write_program(program)
     return program.folder
 
@@ -361,7 +361,7 @@ def test_ray_places_programs_on_a_cluster_of_two_nodes(tmp_path: Path) -> None:
         cluster.shutdown()
     assert outcomes[folders[0]] is None
     assert "exit status 2" in str(outcomes[folders[1]])
-    assert (tmp_path / "runs" / "trpo" / "summary.json").exists()
+    assert (tmp_path / "runs" / "expert" / "summary.json").exists()
 
 
 def test_submitit_carries_programs_out(tmp_path: Path) -> None:
@@ -371,7 +371,7 @@ def test_submitit_carries_programs_out(tmp_path: Path) -> None:
     outcomes = dict(workers.on_slurm(folders, 2, tmp_path / "slurm", {"timeout_min": 10}))
     assert outcomes[folders[0]] is None
     assert "exit status 2" in str(outcomes[folders[1]])
-    assert (tmp_path / "runs" / "trpo" / "summary.json").exists()
+    assert (tmp_path / "runs" / "expert" / "summary.json").exists()
 
 
 def die_once(folder: Path) -> None:
