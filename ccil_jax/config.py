@@ -6,6 +6,7 @@ sweeping it needs no compilation, and it may differ between vmapped runs).
 
 import dataclasses
 import math
+import numbers
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -218,7 +219,7 @@ class Config:
         if unknown := changes.keys() - _DEFAULTS.keys():
             raise ConfigError(f"--{min(unknown)}: unknown; no field of Config has that name")
         config = cls(**{**base, **changes})
-        _check_choices(config)
+        _check_types(config)
         check_used(config, changes)
         return config.replace(**{name: _DEFAULTS[name] for name in unused(config) if name not in changes})
 
@@ -403,10 +404,29 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def _check_choices(config: Config) -> None:
-    for name, allowed in CHOICES.items():
-        if getattr(config, name) not in allowed:
-            raise ConfigError(f"--{name} {getattr(config, name)!r}: unknown; choose one of {', '.join(allowed)}")
+def _check_types(config: Config) -> None:
+    """Raises `ConfigError` for a value of another kind than the field's: one that is no choice, or no such number."""
+    for name, default in _DEFAULTS.items():
+        value = getattr(config, name)
+        if name in CHOICES:
+            if value not in CHOICES[name]:
+                raise ConfigError(f"--{name} {value!r}: unknown; choose one of {', '.join(CHOICES[name])}")
+            continue
+        if isinstance(default, bool):
+            sound, wanted = isinstance(value, bool), "True or False"
+        elif isinstance(default, tuple):
+            sound, wanted = isinstance(value, tuple) and all(map(_is_integer, value)), "a tuple such as (100, 100)"
+        elif isinstance(default, int):
+            sound, wanted = _is_integer(value), "an integer"
+        else:
+            is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+            sound, wanted = is_number or (value is None and default is None), "a number"
+        if not sound:
+            raise ConfigError(f"--{name} {value!r}: give {wanted}")
+
+
+def _is_integer(value: Any) -> bool:
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
 def validate(config: Config) -> None:
@@ -415,27 +435,11 @@ def validate(config: Config) -> None:
     A field that makes no difference must have its default: any other value was given by hand, in vain. A resolved
     limit of the demonstrations' is let through; `with_limit_of` compares it with them.
     """
-    _check_choices(config)
+    _check_types(config)
     resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
     check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))
-    for name in (
-        "env_steps",
-        "num_envs",
-        "batch_size",
-        "generator_steps",
-        "discriminator_steps",
-        "discriminator_minibatch_size",
-        "cg_iterations",
-        "fisher_stride",
-        "line_search_steps",
-        "critic_epochs",
-        "critic_minibatch_size",
-        "bc_epochs",
-        "replay_size",
-        "updates_per_step",
-        "max_skipped_updates",
-    ):
-        if getattr(config, name) < 1:
+    for name, default in _DEFAULTS.items():
+        if _is_integer(default) and getattr(config, name) < 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
         raise ConfigError(f"--hidden_sizes {config.hidden_sizes}: give at least one layer of at least one unit")

@@ -6,6 +6,7 @@ A manifest is written last, whole or not at all: a step without one was not fini
 import dataclasses
 import hashlib
 import json
+import operator
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -178,6 +179,6 @@ def _sha256(content: Mapping[str, Any]) -> str:
 
 
 def _plain(value: dict[str, Any]) -> dict[str, Any]:
-    """As it comes back from JSON: lists for tuples."""
-    plain: dict[str, Any] = json.loads(json.dumps(value))
+    """As it comes back from JSON: lists for tuples, Python's numbers for NumPy's."""
+    plain: dict[str, Any] = json.loads(json.dumps(value, default=operator.methodcaller("item")))
     return plain

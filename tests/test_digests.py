@@ -193,6 +193,7 @@ def test_another_training_is_refused(folder: Path, identity: Identity, message: 
         other(configs=tuple(config.replace(env_steps=10**9) for config in IDENTITY.configs)),  # for longer
         other(configs=tuple(config.replace(gate="episode") for config in IDENTITY.configs)),  # lgail has no gate
         other(seed=None, demonstrations=None),  # not known
+        other(seed=np.int64(0), configs=tuple(config.replace(num_envs=np.int32(16)) for config in IDENTITY.configs)),
     ],
 )
 def test_what_makes_no_difference_is_not_compared(folder: Path, identity: Identity) -> None:
