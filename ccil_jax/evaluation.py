@@ -1,7 +1,7 @@
 """Whole episodes of a fixed policy: evaluation, recording of demonstrations, and the random policy."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -107,24 +107,32 @@ def evaluate(
     num_episodes: int = 50,
     seed: int = 0,
     deterministic: bool = False,
-    shared_episodes: bool = False,
+    draws: Sequence[int] | None = None,
 ) -> Evaluation:
     """Return, cost and length of `num_episodes` fresh episodes for every seed of `actor` ([S]-leading).
 
-    The policy acts stochastically, as it was trained, unless `deterministic`. Every seed draws starts, layouts and
-    noise of its own, so that the seeds' means are independent. With `shared_episodes` all draw the same, for paired
-    comparisons between policies. The seeds are spread over the local devices.
+    The policy acts stochastically, as it was trained, unless `deterministic`. The seeds are spread over the local
+    devices.
+
+    Args:
+        config: of the policies.
+        actor: the policies, [S]-leading.
+        env: the task, unbatched.
+        num_episodes: for each seed.
+        seed: of all random numbers.
+        deterministic: whether the policies act with their modes.
+        draws: a number for each seed. Seeds with the same number play the same starts, layouts and noise, which makes
+            comparisons between their policies paired. None: 0 to S - 1, so that the seeds' means are independent.
     """
-    num_seeds = len(jax.tree.leaves(actor)[0])
-    key = jax.random.key(seed)
-    draws = jnp.zeros(num_seeds, jnp.uint32) if shared_episodes else jnp.arange(num_seeds, dtype=jnp.uint32)
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, draws)
+    numbers = range(len(jax.tree.leaves(actor)[0])) if draws is None else draws
+    draw = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
+    keys = draw(jax.random.key(seed), jnp.asarray(numbers, jnp.uint32))
 
     def run(runs: tuple[Actor, jax.Array]) -> Evaluation:
         actor, key = runs
         return _totals(run_episodes(env, _learnt(config, env, actor, deterministic), num_episodes, key))
 
-    return _spread(run, (actor, keys))
+    return jax.tree.map(np.asarray, _spread(run, (actor, keys)))
 
 
 @jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
@@ -137,16 +145,15 @@ def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) ->
         return _totals(run_episodes(env, _uniform(env), 1, key))
 
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(padded, dtype=jnp.uint32))
-    return jax.tree.map(lambda rows: rows[:num_episodes].T, _spread(run, keys))
+    return jax.tree.map(lambda rows: np.asarray(rows)[:num_episodes].T, _spread(run, keys))
 
 
-def _spread(run: Callable[[Any], Evaluation], runs: PyTree) -> Evaluation:
-    """`run` of every row of `runs` ([R]-leading), the rows shared by the local devices, as NumPy arrays."""
+def _spread(run: Callable[[Any], Any], runs: PyTree) -> Any:
+    """`run` of every row of `runs` ([R]-leading), the rows shared by the local devices."""
     mesh = run_mesh(len(jax.tree.leaves(runs)[0]))
     by_run = PartitionSpec("runs")
     shared = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=by_run, out_specs=by_run, check_vma=False)
-    placed = jax.device_put(runs, NamedSharding(mesh, by_run))
-    return jax.tree.map(np.asarray, jax.jit(shared)(placed))
+    return jax.jit(shared)(jax.device_put(runs, NamedSharding(mesh, by_run)))
 
 
 @jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose

@@ -16,6 +16,7 @@ from ccil_jax.config import Config, ConfigError, field_names, validate, with_lim
 from ccil_jax.demonstrations import Demonstrations, check_time_limit
 from ccil_jax.digests import CheckpointError, Identity, identity_of
 from ccil_jax.guard import GuardedState
+from ccil_jax.history import without_unknown
 from ccil_jax.program import Program, compile_program, make_agent
 from ccil_jax.rollout import Actor
 from ccil_jax.types import ExpertData, ExpertTransitions
@@ -24,8 +25,6 @@ from envs.base import Environment
 CHECKPOINT_SECONDS = 60.0  # about this much work is lost with a killed process
 SAVING_SHARE = 0.02  # of the time: large states are saved less often
 CHUNK_SECONDS = 1.0  # between two looks from Python, unless one iteration takes longer
-
-EPISODE_ESTIMATES = ("episode_return", "episode_cost", "episode_length")  # metrics of whole episodes
 
 History = dict[str, np.ndarray]
 
@@ -84,8 +83,9 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
             ("obs", demonstrations.obs, env.obs_dim),
             ("actions", demonstrations.actions, env.action_dim),
         ):
-            if array.shape[1] != size:
-                raise ConfigError(f"demonstrations: {name} has {array.shape[1]} columns but {env.name} has {size}")
+            if array.shape[1:] != (size,):
+                columns_found = array.shape[1] if array.ndim == 2 else f"shape {array.shape}, not rows of"
+                raise ConfigError(f"demonstrations: {name} has {columns_found} columns but {env.name} has {size}")
         check_time_limit(demonstrations, "demonstrations", env.max_episode_steps)
     if demonstrations is not None:
         config = with_limit_of(config, demonstrations.mean_episode_cost)
@@ -248,7 +248,9 @@ def train_runs(
         )
         if checkpoints and found:
             done, (state, history) = found, _restore(checkpoints, found, program)
-            history = _without_unknown(history)
+            history = without_unknown(history)
+            if not config.has_multiplier:
+                history.pop("multiplier", None)  # an earlier version logged 0 for methods that have none
         else:
             keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
             done, state, history = 0, program.init(keys), {}
@@ -265,7 +267,7 @@ def train_runs(
             stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
             elapsed = time.perf_counter() - chunk_start
             history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
-            history = _without_unknown(history)
+            history = without_unknown(history)
             rows = {name: values[-length:] for name, values in history.items()}
             done += length
             stop = done >= last or bool(stopped.all()) or (should_stop is not None and should_stop())
@@ -334,6 +336,8 @@ def save(result: Result, directory: Path) -> None:
 
     What another training has left in `directory` is set aside.
     """
+    if not result.metrics:
+        raise ConfigError(f"{directory}: nothing to save, as no iteration was carried out")
     with Checkpointer(directory, result.identity) as checkpoints:
         checkpoints.replace(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
 
@@ -366,29 +370,14 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device),
         jax.eval_shape(init, jax.random.key(0)),
     )
-    # The limit as resolved is not known without the demonstrations; the temperature does not matter for acting.
+    # Numbers inside the program do not matter for acting, and the limit may not be known without the demonstrations.
     identity = Identity(configs=(config,), num_seeds=num_seeds)
-    with Checkpointer(
-        checkpoint_dir, identity, free=frozenset({"cost_limit", "temperature"}), readonly=True
-    ) as checkpoints:
+    with Checkpointer(checkpoint_dir, identity, free=frozenset(field_names(traced=True)), readonly=True) as checkpoints:
         step = checkpoints.latest_step()
         if step is None:
             raise CheckpointError(f"{checkpoint_dir}: holds no finished checkpoint; train first, or continue the run")
         saved = checkpoints.restore(step, {"state": like, "history": checkpoints.structure(step)["history"]})
     return Loaded(config=config, agent=saved["state"].actor)
-
-
-def _without_unknown(history: History) -> History:
-    """The metrics, with NaN for a seed's return, cost and length of episodes before its first episode has ended.
-
-    The learner's own estimates then stand at a start value, which nobody has measured. An iteration that was taken back
-    ends no episode.
-    """
-    if "episodes_finished" not in history:
-        return history
-    taken_back = np.diff(history["skipped_updates"], axis=0, prepend=0) > 0
-    known = np.cumsum(np.where(taken_back, 0, history["episodes_finished"]), axis=0) > 0
-    return history | {name: np.where(known, history[name], np.nan) for name in EPISODE_ESTIMATES}
 
 
 def _rows(metrics: History, done: int, config: Config) -> History:

@@ -31,9 +31,13 @@ def row(variant: Variant) -> Row:
         content[f"{name}_low"] = interval.low if interval else None
         content[f"{name}_high"] = interval.high if interval else None
         content[f"{name}_per_seed"] = values
+        if name in ("episode_return", "episode_cost"):  # means over episodes, which have errors
+            content[f"{name}_standard_error_per_seed"] = [
+                seed.get(f"{name}_standard_error") for seed in summary["per_seed"]
+            ]
     content["violation_beyond_error"] = summary.get("violation_beyond_error")  # earlier versions do not say
     metrics = run_folder.read_metrics(variant.plan.folder)
-    limit = summary["cost_limit"] if summary["expert_cost"] is None else summary["expert_cost"]
+    limit = summary["expert_cost"] if summary["cost_limit"] is None else summary["cost_limit"]
     content |= multiplier_path(variant.plan.config, metrics, limit)
     rate, num_runs = summary["env_steps_per_second"], summary["runs_in_program"]
     return content | {"env_steps_per_second": rate, "runs_in_program": num_runs}

@@ -37,8 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
     out: Path = arguments.out
     if out.suffix != ".npz":
         raise UsageError(f"--out {out}: a demonstrations file is named *.npz")
-    if out.exists() and not arguments.overwrite:
-        raise UsageError(f"--out {out}: exists; choose another name or add --overwrite")
+    command_line.check_new_file(out, "--out", overwrite=arguments.overwrite)
     if arguments.default_cost is not None and not 0 <= arguments.default_cost < float("inf"):
         raise UsageError(f"--default-cost {arguments.default_cost}: must be finite and not negative")
     demonstrations = load_demonstrations(arguments.file, default_cost=arguments.default_cost)

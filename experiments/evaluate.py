@@ -139,9 +139,9 @@ def describe_recording(arguments: argparse.Namespace, stored: Run) -> dict[str, 
                 raise UsageError(f"--{option} {value}: says what to record; add --record FILE.npz")
         return None
     if arguments.deterministic:
-        raise UsageError("--deterministic: demonstrations are recorded from sampled actions; leave --record or it out")
+        raise UsageError("--deterministic: demonstrations are recorded from sampled actions; leave one of the two out")
     if arguments.simulator == "original":
-        raise UsageError("--simulator original: demonstrations are recorded in ours; leave --record or it out")
+        raise UsageError("--simulator original: demonstrations are recorded in ours; leave one of the two out")
     finished = recording.read_summary(stored)
     rows, seed_index = finished["per_seed"], arguments.seed_index
     if seed_index is None:
@@ -176,18 +176,21 @@ def evaluate_run(
         "num_episodes": arguments.episodes,
         "seed": arguments.seed,
         "deterministic": arguments.deterministic,
-        "shared_episodes": arguments.shared_episodes,
     }
+    recorded = {**settings, "shared_episodes": arguments.shared_episodes}
+    draws = [0] * stored.facts["num_seeds"] if arguments.shared_episodes else None
     if arguments.simulator == "ours":
-        evaluated: Any = evaluation.evaluate(loaded.config, loaded.agent, env, **settings)
+        evaluated: Any = evaluation.evaluate(loaded.config, loaded.agent, env, draws=draws, **settings)
     else:
         contact_cost = stored.facts["env_options"].get("contact_cost", True)
-        evaluated = original.evaluate(loaded.config, loaded.agent, env, contact_cost=contact_cost, **settings)
+        evaluated = original.evaluate(
+            loaded.config, loaded.agent, env, draws=draws, contact_cost=contact_cost, **settings
+        )
     facts = {
         "task": env.name,
         "original": TASKS[env.name].original,
         "simulator": arguments.simulator,
-        **settings,
+        **recorded,
         **run_folder.provenance(),
     }
     for file in arguments.export:
@@ -213,7 +216,7 @@ def evaluate_run(
     return {
         "run": str(stored.folder.resolve()),
         "simulator": arguments.simulator,
-        **settings,
+        **recorded,
         **run_folder.provenance(),
         **dataclasses.asdict(reference),
         "per_seed": rows,

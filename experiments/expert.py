@@ -61,8 +61,7 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         raise UsageError("--cost-limit: --unconstrained has no limit; give one or the other")
     if arguments.out.suffix != ".npz":
         raise UsageError(f"--out {arguments.out}: a demonstrations file is named *.npz")
-    if arguments.out.exists() and not arguments.overwrite:
-        raise UsageError(f"--out {arguments.out}: exists; choose another name or add --overwrite")
+    command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
     saved = _resumed(arguments.run_dir, given) if arguments.resume else {}
     choices = {**DEFAULTS, "env": None, **saved, **given}
     task = options.find_task(choices["env"])
@@ -88,7 +87,7 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
         resume=arguments.resume,
         eval_episodes=choices["eval_episodes"],
         command=command_line.command(),
-        moved=tuple(name for name in MOVABLE if arguments.resume and name in given),
+        moved=MOVABLE if arguments.resume else (),
     )
 
 
@@ -98,6 +97,14 @@ def _resumed(folder: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:
     if saved["method"] != given["method"]:
         with_limit = "leave --unconstrained out" if given["method"] == "trpo" else "add --unconstrained"
         raise UsageError(f"--resume: the run in {folder} is of method {saved['method']}; {with_limit} to resume it")
+    ended = folder is not None and (folder / "summary.json").is_file()
+    if ended and given.get("env_steps", saved.get("env_steps")) == saved.get("env_steps"):
+        for name in MOVABLE:
+            if name != "cost_limit" and given.get(name, saved.get(name)) != saved.get(name):
+                option = f"--{name.replace('_', '-')} {given[name]}"
+                raise UsageError(
+                    f"{option}: the run in {folder} has ended, so nothing would be trained; add --env-steps"
+                )
     return saved
 
 
@@ -112,8 +119,9 @@ def run(arguments: argparse.Namespace) -> int:
         remedy += ["--num-trajectories", str(arguments.num_trajectories)]
         print(
             f"no seed keeps --cost-limit {plan.config.cost_limit:g} (lowest cost {lowest['episode_cost']:g}): nothing "
-            "was recorded; train longer (--env-steps), use more seeds or a higher limit, or record that policy all the "
-            f"same: {command_line.launcher_command('evaluate')} {shlex.join(remedy)}",
+            f"was recorded; train longer (--resume --run-dir {shlex.quote(str(plan.folder))} --env-steps N, and "
+            "--cost-limit for a higher limit), use more seeds in a new run, or record that policy all the same: "
+            f"{command_line.launcher_command('evaluate')} {shlex.join(remedy)}",
             file=sys.stderr,
         )
         return 1

@@ -4,7 +4,7 @@ Reward and cost follow the task's rule (`envs.locomotion`), fed with the reward 
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -111,7 +111,7 @@ def evaluate(
     num_episodes: int,
     seed: int = 0,
     deterministic: bool = False,
-    shared_episodes: bool = False,
+    draws: Sequence[int] | None = None,
     contact_cost: bool = True,
 ) -> Totals:
     """As `ccil_jax.evaluation.evaluate`, in gymnasium's simulator. `actor` is [num_seeds]-leading.
@@ -119,8 +119,7 @@ def evaluate(
     `contact_cost` is the option of that name which `env` was made with.
     """
     simulator, learnt, results = make_simulator(env), policies(config, actor, env), []
-    for index, policy in enumerate(learnt):
-        draw = 0 if shared_episodes else index
+    for draw, policy in zip(range(len(learnt)) if draws is None else draws, learnt, strict=True):
         random = np.random.default_rng([seed, draw])
         for episode in range(num_episodes):
             (start,) = np.random.SeedSequence([seed, draw, episode]).generate_state(1)

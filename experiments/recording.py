@@ -42,7 +42,8 @@ def read_summary(run: Run) -> dict[str, Any]:
         is_whole = False
     if not is_whole:
         raise UsageError(f"{path}: numbers are missing; repeat the evaluation with --resume")
-    if summary["env_steps"] < config.num_iterations * config.steps_per_iteration:
+    given_up = all((run.folder / f"fault_seed_{row['seed']}.npz").is_file() for row in summary["per_seed"])
+    if summary["env_steps"] < config.num_iterations * config.steps_per_iteration and not given_up:
         raise UsageError(unfinished)  # it was continued for longer, so the summary is of an older policy
     return summary
 

@@ -17,6 +17,7 @@ from typing import Any, Self, TextIO
 import numpy as np
 
 from ccil_jax.config import Config
+from ccil_jax.history import without_unknown
 from ccil_jax.versions import versions
 from envs.registry import TASKS
 from experiments.command_line import UsageError, command
@@ -55,7 +56,6 @@ METRICS = (  # order of the columns; a method leaves out those that it lacks
     "held_out_loss",
     "skipped_updates",
 )
-EPISODE_METRICS = ("episode_return", "episode_cost", "episode_length")  # unknown before an episode has ended
 _FACTS = frozenset(
     {"task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations"}
     | {"expert_return", "expert_cost", "expert_length"}
@@ -187,18 +187,7 @@ def read_metrics(folder: Path) -> dict[str, np.ndarray]:
     except (OSError, StopIteration, ValueError, IndexError):
         raise UsageError(f"{path}: missing, empty or damaged; give a run folder with at least one iteration") from None
     metrics = {name: shaped[:, :, i] for i, name in enumerate(names) if name not in ("iteration", "seed")}
-    return _without_placeholders(metrics)
-
-
-def _without_placeholders(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """NaN for the numbers that earlier versions wrote of episodes before a seed's first one had ended."""
-    if "episodes_finished" not in metrics:
-        return metrics
-    known = np.cumsum(metrics["episodes_finished"], axis=0) > 0
-    return {
-        name: np.where(known, values, math.nan) if name in EPISODE_METRICS else values
-        for name, values in metrics.items()
-    }
+    return without_unknown(metrics)  # earlier versions wrote numbers before there were any
 
 
 class MetricsWriter:

@@ -134,8 +134,16 @@ def aggregate_scores(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | 
             continue
         interval = bootstrap_interval([np.array(values)])
         spread = {"mean": float(np.mean(values)), "std": float(np.std(values)) if len(values) > 1 else None}
+        if (error := f"{name}_standard_error") in rows[0]:
+            spread["standard_error"] = _of_mean([row[error] for row in rows])
         result[name] = {"iqm": interval.value, "low": interval.low, "high": interval.high, **spread}
     return result
+
+
+def _of_mean(errors: list[float | None]) -> float | None:
+    """The standard error of the mean over seeds' episodes, which are independent; None where a seed's is unknown."""
+    known = [error for error in errors if error is not None]
+    return float(np.sqrt(np.sum(np.square(known)))) / len(known) if len(known) == len(errors) else None
 
 
 def mean_violation_beyond_error(rows: list[dict[str, Any]], reference: Reference) -> bool | None:
@@ -158,6 +166,9 @@ def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, 
     table.add_section()
     mean_is_beyond = mean_violation_beyond_error(rows, reference)
     iqm, mean = ([number(aggregate[c] and aggregate[c][key]) for c in columns] for key in ("iqm", "mean"))
+    mean[:2] = (
+        with_error(*(aggregate[c] and aggregate[c].get(key) for key in ("mean", "standard_error"))) for c in columns[:2]
+    )
     table.add_row("IQM", *iqm)
     table.add_row("95% interval", *(_interval(aggregate[c]) for c in columns))
     table.add_row("mean", *mean[:3], marked(mean[3], mean_is_beyond))

@@ -94,7 +94,7 @@ def execute_together(
         Display(
             title,
             first.config.num_iterations,
-            first.config.cost_limit,
+            first.config.cost_limit if len({plan.config.cost_limit for plan in plans}) == 1 else None,
             has_multiplier=first.config.has_multiplier,
         ) as display,
         Interruption() as interruption,
@@ -110,7 +110,8 @@ def execute_together(
         env = envs.make(first.task, physics=first.physics, **first.env_options)
         missing = {i: _with_earlier_commands(plan) for i, plan in enumerate(plans) if plan.folder not in finished}
         for plan in missing.values():
-            run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
+            if not plan.resume:  # else it is written once it is certain that the run goes on
+                run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
         results, rate = _train(plans, missing, env, checkpoint_dir, display, interruption, resume=resume)
         carried_out = [(plan, results[i]) for i, plan in missing.items()]
         for plan, result in carried_out:
@@ -166,6 +167,9 @@ def _train(
         ]
 
         def on_start(history: "History") -> None:
+            for plan in missing.values():
+                if plan.resume:
+                    run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
             for writer, own in writers:
                 writer.begin({name: rows[:, own] for name, rows in history.items()})
             interruption.defer()
@@ -212,8 +216,10 @@ def _evaluate(carried_out: Sequence[tuple[Plan, "Result"]], env: Any) -> tuple[l
 
     first, result = carried_out[0]
     settings: Any = {"num_episodes": first.eval_episodes, "seed": first.evaluation_seed}
+    # Each seed of a run plays episodes of its own, and the same ones whatever is evaluated beside the run.
+    draws = list(range(first.num_seeds)) * len(carried_out)
     agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for _, result in carried_out])
-    together = evaluation.evaluate(result.config, agents, env, **settings)
+    together = evaluation.evaluate(result.config, agents, env, draws=draws, **settings)
     own = runner.columns(len(carried_out), first.num_seeds)
     evaluations = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], together) for rows in own]
     return evaluations, evaluation.random_policy(env, **settings)

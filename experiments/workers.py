@@ -9,6 +9,7 @@ import importlib.util
 import math
 import os
 import queue
+import shlex
 import subprocess
 import sys
 import threading
@@ -182,7 +183,14 @@ def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settin
     import submitit
 
     executor = submitit.AutoExecutor(folder=log_folder)
-    defaults = {"name": "ccil_jax", "timeout_min": _LONGEST_JOB_MINUTES, "slurm_array_parallelism": num_workers}
+    # A job's Python is not to look for our packages in the folder that it is submitted from.
+    setup = [f"export PYTHONSAFEPATH=1 PYTHONPATH={shlex.quote(python_path())}"]
+    defaults = {
+        "slurm_setup": setup,
+        "name": "ccil_jax",
+        "timeout_min": _LONGEST_JOB_MINUTES,
+        "slurm_array_parallelism": num_workers,
+    }
     executor.update_parameters(**{**defaults, **settings})
     folder_of = dict(zip(executor.map_array(run_worker, folders), folders, strict=True))
     jobs, running, lost = list(folder_of), set(folder_of), set()

@@ -34,6 +34,7 @@ ORDER = (
     "methods",
     "config",
     "files",
+    "history",
     "versions",
     "types",
     "distributions",

@@ -37,10 +37,11 @@ def test_every_seed_plays_episodes_of_its_own(three: Evaluation) -> None:
 
 def test_a_seeds_episodes_do_not_depend_on_the_others(three: Evaluation) -> None:
     np.testing.assert_allclose(evaluate(1).episode_return[0], three.episode_return[0], rtol=1e-5)
+    np.testing.assert_allclose(evaluate(1, draws=[2]).episode_return[0], three.episode_return[2], rtol=1e-5)
 
 
-def test_shared_episodes_are_those_of_the_first_seed_for_all(three: Evaluation) -> None:
-    shared = evaluate(3, shared_episodes=True)
+def test_seeds_with_the_same_draw_play_the_same_episodes(three: Evaluation) -> None:
+    shared = evaluate(3, draws=[0, 0, 0])
     for name in ("episode_return", "episode_cost", "episode_length"):
         rows = getattr(shared, name)
         np.testing.assert_array_equal(rows, np.stack([rows[0]] * 3))

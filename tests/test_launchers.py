@@ -363,6 +363,10 @@ def test_resume_refuses_other_choices(
         (["--initial-multiplier", "3"], "--initial-multiplier 3.0: the run in"),
         (["--gamma", "0.5"], "--gamma 0.5: the run in"),
         (["--gate", "episode"], "--gate episode: makes no difference to this run of method expert"),
+        (
+            ["--multiplier-max", "3"],
+            "--multiplier-max 3.0: the run in",
+        ),  # it has ended: nothing would be trained with it
     ],
 )
 def test_what_an_expert_may_not_change_when_it_goes_on(
@@ -388,6 +392,26 @@ def test_an_expert_goes_on_under_another_limit(pipeline: Path, tmp_path: Path) -
     facts = load_demonstrations(tmp_path / "e.npz").metadata
     assert (facts["cost_limit"], facts["limit_kept"]) == (19.0, True)
     assert len(facts["command"].splitlines()) == 2
+
+    # Another limit alone takes no training: it says what is recorded. The run can still be read, and continued.
+    assert expert.main([*made, "--overwrite", "--cost-limit", "18", "--num-trajectories", "2"]) == 0
+    assert load_demonstrations(tmp_path / "e.npz").metadata["cost_limit"] == 18.0
+    assert evaluate.main([f"{tmp_path}/expert", "--episodes", "2"]) == 0
+    assert expert.main([*made, "--overwrite", "--env-steps", "480", "--num-trajectories", "2"]) == 0
+    assert len(run_folder.read_metrics(tmp_path / "expert")["env_steps"]) == 4
+
+
+def test_a_resume_that_is_refused_leaves_the_run_as_it_was(
+    pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(pipeline / "expert", tmp_path / "expert")
+    for manifest in (tmp_path / "expert" / "checkpoints").glob("*/manifest.json"):
+        manifest.write_text("{}")
+    before = (tmp_path / "expert" / "config.json").read_bytes()
+    with pytest.raises(SystemExit):
+        expert.main(["--out", f"{tmp_path}/e.npz", "--run-dir", f"{tmp_path}/expert", "--resume", "--env-steps", "960"])
+    assert "no other is intact" in capsys.readouterr().err
+    assert (tmp_path / "expert" / "config.json").read_bytes() == before
 
 
 def test_resume_refuses_other_demonstrations(

@@ -70,6 +70,35 @@ def test_no_step_is_no_step(tmp_path: Path) -> None:
         train(stop_after=-1)
 
 
+def test_what_took_no_step_has_nothing_to_save(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nothing to save, as no iteration was carried out"):
+        runner.save(train(stop_after=0), tmp_path)
+
+
+def test_a_multiplier_that_an_earlier_version_logged_is_left_out(
+    several: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It wrote 0 for methods that have none; the metrics of a resumed run must agree with those of the checkpoint."""
+    shutil.copytree(several, tmp_path / "copy")
+    restore = runner._restore
+
+    def older(*arguments: Any) -> Any:
+        state, history = restore(*arguments)
+        return state, {**history, "multiplier": np.zeros((1, 4), np.float32)}
+
+    monkeypatch.setattr(runner, "_restore", older)
+    seen: list[set[str]] = []
+    result, _ = train_several(
+        tmp_path / "copy",
+        resume=True,
+        stop_after=2,
+        on_start=lambda history: seen.append(set(history)),
+        on_progress=lambda progress: seen.append(set(progress.metrics)),
+    )
+    assert seen == [set(result.metrics)] * 2
+    assert "multiplier" not in result.metrics
+
+
 def other_demonstrations() -> Demonstrations:
     same = walk_demonstrations()
     return dataclasses.replace(same, actions=-same.actions)

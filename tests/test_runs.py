@@ -17,6 +17,7 @@ import pytest
 import envs
 from ccil_jax import agents, runner
 from ccil_jax.config import Config, ConfigError
+from ccil_jax.history import EPISODE_ESTIMATES, without_unknown
 from ccil_jax.program import compile_program
 from ccil_jax.runner import Result
 from experiments import devices
@@ -110,13 +111,13 @@ def test_before_an_episode_has_ended_nothing_is_said_of_episodes() -> None:
     for name, value in (("episode_return", 100.0), ("episode_cost", 200.0), ("episode_length", 100.0)):
         assert np.isnan(metrics[name][:6]).all()
         np.testing.assert_array_equal(metrics[name][6:], np.full((2, 2), value))
-    assert all(np.isfinite(rows).all() for name, rows in metrics.items() if name not in runner.EPISODE_ESTIMATES)
+    assert all(np.isfinite(rows).all() for name, rows in metrics.items() if name not in EPISODE_ESTIMATES)
 
 
 def test_an_iteration_that_is_taken_back_ends_no_episode() -> None:
-    history = {name: np.ones((4, 1), np.float32) for name in runner.EPISODE_ESTIMATES}
+    history = {name: np.ones((4, 1), np.float32) for name in EPISODE_ESTIMATES}
     history |= {"episodes_finished": np.array([[0], [2], [0], [1]]), "skipped_updates": np.array([[0], [1], [1], [1]])}
-    found = runner._without_unknown(history)
+    found = without_unknown(history)
     assert np.isnan(found["episode_cost"][:3, 0]).all()
     assert found["episode_cost"][3, 0] == 1
     assert found["episode_cost"].dtype == np.float32
@@ -159,7 +160,7 @@ def test_fields_that_agree_stay_numbers() -> None:
 
 ON_FOUR_DEVICES = """
 import json, sys, jax
-from ccil_jax import runner
+from ccil_jax import evaluation, runner
 from ccil_jax.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
@@ -184,6 +185,10 @@ found = train(together, jax.numpy.tile(keys[::4], 3))
 programs = (*single, together, side_by_side)
 print(json.dumps({
     "devices": [len(program.state.agent.key.sharding.device_set) for program in programs],
+    "evaluations": [
+        len(evaluation._spread(lambda key: jax.random.normal(key), jax.random.split(keys[0], n)).sharding.device_set)
+        for n in (1, 3, 6, 8)
+    ],
     "alone": same_bits(alone, first),
     "same": [[same_bits(expected, run) for run in found] for expected in (first, last)],
     "collectives": [
@@ -204,7 +209,7 @@ def test_devices_share_runs_without_a_word(method: str) -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found.pop("same") == [[i == 0 for i in range(6)], [i == 1 for i in range(6)]]
-    assert found == {"devices": [1, 1, 3, 4], "alone": True, "collectives": []}
+    assert found == {"devices": [1, 1, 3, 4], "evaluations": [1, 3, 3, 4], "alone": True, "collectives": []}
 
 
 def test_a_chunk_of_iterations_stays_on_its_device() -> None:

@@ -1,6 +1,7 @@
 """Metrics and their aggregates over seeds, against values worked out by hand."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,8 @@ def test_intervals_and_deviations_of_few_seeds_are_null() -> None:
     returns = np.array([[10.0, 20.0], [30.0, 40.0]])
     rows = per_seed_scores(Episodes(returns, returns, returns), None, REFERENCE)
     entry: Any = aggregate_scores(rows)["episode_return"]
+    error = entry.pop("standard_error")
+    assert error == pytest.approx(math.sqrt(5.0**2 + 5.0**2) / 2)  # each seed's is sqrt(50) / sqrt(2)
     assert entry == {"iqm": 25.0, "low": None, "high": None, "mean": 25.0, "std": 10.0}
     entry = aggregate_scores(rows[:1])["episode_return"]
     assert entry == {"iqm": 15.0, "low": None, "high": None, "mean": 15.0, "std": None}
@@ -191,7 +194,7 @@ def test_the_table_shows_errors_marks_and_no_interval_of_two_seeds(capsys: pytes
     lines = lines_of(printed)
     assert lines["seed 0"] == ["60.00 +- 0.00", "41.00 +- 1.00", "50.00", "0.03"]
     assert lines["seed 1"] == ["60.00 +- 0.00", "52.00 +- 2.00", "50.00", "0.30 *"]
-    assert lines["mean"] == ["60.00", "46.50", "50.00", "0.16 *"]
+    assert lines["mean"] == ["60.00 +- 0.00", "46.50 +- 1.12", "50.00", "0.16 *"]  # sqrt(1 + 4) / 2
     assert lines["95% interval"] == ["-", "-", "-", "-"]
     assert lines["expert"] == ["110.0 +- 6.50", "40.00 +- 2.50", "100", "0"]
     assert lines["random policy"] == ["10.00 +- -", "3.00 +- -", "0", ""]

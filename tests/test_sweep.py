@@ -209,7 +209,7 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
 
     # Interrupted: what is finished stays as it is, what is not is finished, from the checkpoints of its program.
     folder = out / "runs" / "multiplier_learning_rate=0.5,hidden_sizes=4"
-    before = run_folder.read_metrics(folder)
+    before, scores = run_folder.read_metrics(folder), run_folder.read_json(folder / "summary.json")["per_seed"]
     (folder / "summary.json").unlink()
     others = {
         path: path.stat().st_mtime_ns
@@ -218,7 +218,10 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
     }
     assert sweep.main([str(spec), "--out", str(out), "--resume"]) == 0
     assert "in 2 programs, 1 of them unfinished" in capsys.readouterr().out
-    assert (folder / "summary.json").exists()
+    # Whatever is evaluated beside it, a run plays the same episodes.
+    for again, row in zip(run_folder.read_json(folder / "summary.json")["per_seed"], scores, strict=True):
+        assert again["episode_return"] == pytest.approx(row["episode_return"], rel=1e-4)
+        assert again["episode_cost"] == row["episode_cost"]
     program = next(iter(out.glob("programs/*")))
     log = (program / "worker.log").read_text()
     assert sweep_worker.main([str(program)]) == 0  # nothing is left to do
