@@ -122,7 +122,7 @@ def test_intervals_and_deviations_of_few_seeds_are_null() -> None:
     assert error == pytest.approx(math.sqrt(5.0**2 + 5.0**2) / 2)  # each seed's is sqrt(50) / sqrt(2)
     assert entry == {"iqm": 25.0, "low": None, "high": None, "mean": 25.0, "std": 10.0}
     entry = aggregate_scores(rows[:1])["episode_return"]
-    assert entry == {"iqm": 15.0, "low": None, "high": None, "mean": 15.0, "std": None}
+    assert entry == {"iqm": 15.0, "low": None, "high": None, "mean": 15.0, "std": None, "standard_error": 5.0}
 
 
 def demonstrations(costs: list[float], rewards: list[float] | None) -> Demonstrations:
