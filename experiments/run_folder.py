@@ -127,7 +127,7 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
 
 def git_commit() -> str | None:
     """Commit of the sources, with `-dirty` after it where files of the checkout differ; None where it is not known."""
-    return _checkout_commit() or _installed_commit()
+    return _checkout_commit() or _built_commit() or _installed_commit()
 
 
 def _checkout_commit() -> str | None:
@@ -139,6 +139,14 @@ def _checkout_commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return head + ("-dirty" if changed else "")
+
+
+def _built_commit() -> str | None:
+    """The commit that the wheel of this installation was built from, as `hatch_build.py` wrote it down."""
+    try:
+        return (Path(__file__).parent.parent / "ccil_jax" / "COMMIT").read_text(encoding="utf-8").strip() or None
+    except OSError:
+        return None
 
 
 def _installed_commit() -> str | None:

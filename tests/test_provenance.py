@@ -39,6 +39,14 @@ def test_an_installation_knows_the_commit_that_pip_built(
     assert run_folder.git_commit() == commit
 
 
+def test_a_wheel_says_which_commit_it_was_built_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, HERE, {"url": "file:///wheel", "archive_info": {}})
+    (tmp_path / "ccil_jax").mkdir()
+    (tmp_path / "ccil_jax" / "COMMIT").write_text(f"{COMMIT}-dirty\n")
+    monkeypatch.setattr(run_folder, "__file__", str(tmp_path / "experiments" / "run_folder.py"))
+    assert run_folder.git_commit() == f"{COMMIT}-dirty"
+
+
 def test_the_commit_of_another_installation_is_not_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(monkeypatch, tmp_path, {"vcs_info": {"commit_id": COMMIT}})
     assert run_folder.git_commit() is None
