@@ -49,7 +49,8 @@ class Checkpointer:
         free: frozenset[str] = frozenset(),
         readonly: bool = False,
     ) -> None:
-        self._directory = directory.resolve()  # orbax fails in the background on a relative path
+        self._directory = Path(directory).resolve()  # orbax fails in the background on a relative path
+        check_path(self._directory)
         self._identity, self._free, self._readonly = identity, free | _FREE, readonly
         handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
         with _warnings_of_orbax(logging.ERROR if readonly else logging.NOTSET):  # it warns of what was asked for
@@ -193,6 +194,12 @@ class Checkpointer:
     def close(self) -> None:
         """Frees the manager's threads. No save is in flight."""
         self._manager.close()
+
+
+def check_path(path: Path) -> None:
+    """Raises `CheckpointError` for a path that orbax takes for a pattern: it would lose what is saved there."""
+    if "[" in str(path):
+        raise CheckpointError(f"{path}: checkpoints cannot be kept below a folder with [ in its name; choose another")
 
 
 @contextlib.contextmanager

@@ -219,7 +219,7 @@ class Config:
         if unknown := changes.keys() - _DEFAULTS.keys():
             raise ConfigError(f"--{min(unknown)}: unknown; no field of Config has that name")
         config = cls(**{**base, **changes})
-        _check_types(config)
+        check_types(config)
         check_used(config, changes)
         return config.replace(**{name: _DEFAULTS[name] for name in unused(config) if name not in changes})
 
@@ -404,7 +404,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 
 
-def _check_types(config: Config) -> None:
+def check_types(config: Config) -> None:
     """Raises `ConfigError` for a value of another kind than the field's: one that is no choice, or no such number."""
     for name, default in _DEFAULTS.items():
         value = getattr(config, name)
@@ -419,10 +419,19 @@ def _check_types(config: Config) -> None:
         elif isinstance(default, int):
             sound, wanted = _is_integer(value), "an integer"
         else:
-            is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-            sound, wanted = is_number or (value is None and default is None), "a number"
+            sound, wanted = _is_number(value) or (value is None and default is None), "a number"
         if not sound:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
+
+
+def _is_number(value: Any) -> bool:
+    if not isinstance(value, numbers.Real) or isinstance(value, bool):
+        return False
+    try:
+        float(value)
+    except OverflowError:  # an integer beyond all floats
+        return False
+    return True
 
 
 def _is_integer(value: Any) -> bool:
@@ -435,7 +444,7 @@ def validate(config: Config) -> None:
     A field that makes no difference must have its default: any other value was given by hand, in vain. A resolved
     limit of the demonstrations' is let through; `with_limit_of` compares it with them.
     """
-    _check_types(config)
+    check_types(config)
     resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
     check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))
     for name, default in _DEFAULTS.items():

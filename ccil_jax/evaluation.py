@@ -124,6 +124,8 @@ def evaluate(
         draws: a number for each seed. Seeds with the same number play the same starts, layouts and noise, which makes
             comparisons between their policies paired. None: 0 to S - 1, so that the seeds' means are independent.
     """
+    if num_episodes < 1:
+        raise ValueError(f"num_episodes {num_episodes}: must be at least 1")
     numbers = range(len(jax.tree.leaves(actor)[0])) if draws is None else draws
     draw = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
     keys = draw(jax.random.key(seed), jnp.asarray(numbers, jnp.uint32))

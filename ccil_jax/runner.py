@@ -2,9 +2,11 @@
 
 import contextlib
 import dataclasses
+import numbers
 import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -146,7 +148,7 @@ def train(
     num_seeds: int = 1,
     seed: int = 0,
     one_by_one: bool = False,
-    checkpoint_dir: Path | None = None,
+    checkpoint_dir: str | Path | None = None,
     resume: bool = False,
     moved: Collection[str] = (),
     on_start: Callable[[History], None] | None = None,
@@ -204,7 +206,7 @@ def train_runs(
     num_seeds: int = 1,
     seed: int = 0,
     one_by_one: bool = False,
-    checkpoint_dir: Path | None = None,
+    checkpoint_dir: str | Path | None = None,
     resume: bool = False,
     moved: Collection[str] = (),
     on_start: Callable[[History], None] | None = None,
@@ -221,12 +223,21 @@ def train_runs(
         ConfigError: also where the configurations differ in a static field.
     """
     start = time.perf_counter()
-    if num_seeds < 1:
-        raise ConfigError(f"num_seeds {num_seeds}: must be at least 1")
-    if stop_after is not None and stop_after < 0:
-        raise ConfigError(f"stop_after {stop_after}: must be at least 0")
+    if not configs:
+        raise ConfigError("configs: give at least one configuration")
+    _check_integer("num_seeds", num_seeds, 1)
+    _check_integer("seed", seed, 0, 2**32 - 1)
+    _check_integer("stop_after", 0 if stop_after is None else stop_after, 0)
+    for name, value in (("one_by_one", one_by_one), ("resume", resume)):
+        if not isinstance(value, bool):
+            raise ConfigError(f"{name} {value!r}: give True or False")
+    if resume and checkpoint_dir is None:
+        raise ConfigError("resume True: there is nothing to go on from; give checkpoint_dir")
+    if moved and not resume:
+        raise ConfigError(f"moved {', '.join(moved)}: for a training that is resumed; leave it out, or add resume=True")
     if static := set(moved) - set(field_names(traced=True)):
         raise ConfigError(f"moved {min(static)}: only a traced field may differ from the training that is resumed")
+    checkpoint_dir = None if checkpoint_dir is None else Path(checkpoint_dir)
     configs = [resolve(config, env, demonstrations) for config in configs]
     config, varied = join(configs, num_seeds)
     num_runs = len(configs) * num_seeds
@@ -243,6 +254,11 @@ def train_runs(
         found = checkpoints.latest_step() if checkpoints else None
         if checkpoints and found:
             checkpoints.check_identity(found)  # compiling takes longer
+            if found > config.num_iterations:
+                raise ConfigError(
+                    f"env_steps {config.env_steps}: the training in {checkpoint_dir} has done "
+                    f"{found * config.steps_per_iteration}; give at least as many"
+                )
         program = compile_program(
             config, env, expert_data(demonstrations), num_runs, varied=varied, one_by_one=one_by_one
         )
@@ -304,6 +320,12 @@ def train_runs(
         )
         for config, own in zip(configs, columns(len(configs), num_seeds), strict=True)
     ]
+
+
+def _check_integer(name: str, value: Any, least: int, most: int = 2**31 - 1) -> None:
+    is_integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    if not (is_integer and least <= int(value) <= most):
+        raise ConfigError(f"{name} {value!r}: give an integer from {least} to {most}")
 
 
 def columns(num_configs: int, num_seeds: int) -> list[slice]:

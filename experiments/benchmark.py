@@ -66,6 +66,7 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--out", type=Path, default=Path("benchmark.json"), metavar="FILE", help="result file (default: benchmark.json)"
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
     parser.add_argument(
         "--peers",
         type=Path,
@@ -236,6 +237,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.jobs > 1 and (arguments.profile or arguments.peers):
         raise UsageError("--jobs: neither --profile nor --peers takes turns; leave it out")
     pythons = peers.find_pythons(arguments.peers) if arguments.peers else None
+    command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
     command_line.check_writable(arguments.out.parent, "--out")
     facts = facts_of_machine()
     rows: list[dict[str, Any]] = []

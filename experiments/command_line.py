@@ -175,6 +175,10 @@ def check_output_folder(
         raise UsageError(f"{option} {folder}: already holds a run; continue it with --resume or choose another folder")
     if occupied and not resume:
         raise UsageError(f"{option} {folder}: not empty; choose a new folder")
+    if "[" in str(folder.resolve()):  # see `ccil_jax.checkpointing.check_path`
+        raise UsageError(
+            f"{option} {folder}: checkpoints cannot be kept below a folder with [ in its name; choose another"
+        )
     check_writable(folder, option)
 
 

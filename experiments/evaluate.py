@@ -81,6 +81,8 @@ def run(arguments: argparse.Namespace) -> None:
     if not arguments.run.is_dir():
         raise UsageError(f"RUN_DIR {arguments.run}: no such folder; give a folder that `train` wrote")
     stored = run_folder.read_run(arguments.run)
+    if stored.facts["task"] not in TASKS:
+        raise UsageError(f"RUN_DIR {arguments.run}: of task {stored.facts['task']}, which is not known here")
     checkpoints = arguments.run / "checkpoints"
     if not checkpoints.is_dir() or not any(checkpoints.iterdir()):
         raise UsageError(f"RUN_DIR {arguments.run}: holds no checkpoint; train first, or resume with `train --resume`")

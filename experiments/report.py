@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ccil_jax.config import relevant
 from experiments import command_line, run_folder
 from experiments.command_line import Parser, UsageError
 from experiments.labels import distinct_names
@@ -17,6 +18,7 @@ from experiments.run_folder import Run
 from experiments.statistics import bootstrap_interval
 from experiments.summary import BEYOND_ERROR, bounds, marked, number
 
+_NEEDED = {"num_seeds", "per_seed", "env_steps", "env_steps_per_second", "expert_cost"}  # of summary.json
 _COLUMNS = (
     ("episode_return", "return"),
     ("episode_cost", "cost"),
@@ -25,6 +27,7 @@ _COLUMNS = (
     ("penalized_return", "penalised return, %"),
     ("cost_rate", "cost rate in training"),
 )
+_PAGE = "<meta name=generator content='ccil_jax report'>"
 _NOTE = (
     "Runs: interquartile mean over seeds with its 95% bootstrap interval, [-] where there are too few seeds for one. "
     "Seeds, expert and random policy: mean &plusmn; standard error over episodes. A dash: not known. Marked (*): a "
@@ -77,6 +80,9 @@ def make_parser() -> Parser:
         "--seed", default=0, type=command_line.natural, metavar="N", help="of the bootstrap (default: 0)"
     )
     parser.add_argument(
+        "--overwrite", action="store_true", help="replace existing files that are no page of this launcher"
+    )
+    parser.add_argument(
         "--no-animation", action="store_true", help="leave out the episodes that are played on the page"
     )
     return parser
@@ -93,9 +99,19 @@ def read_entries(folders: Sequence[Path]) -> list[Entry]:
         run = run_folder.read_run(folder)
         if not (folder / "summary.json").is_file():
             raise UsageError(f"RUN_DIR {folder}: not finished (no summary.json); finish it with `train --resume`")
-        entries.append(Entry(run, run_folder.read_json(folder / "summary.json"), run.config.method, len(entries)))
+        entries.append(Entry(run, _read_summary(folder), run.config.method, len(entries)))
     alike = ([other for other in entries if (other.task, other.label) == (e.task, e.label)] for e in entries)
     return [_distinct(e, others) for e, others in zip(entries, alike, strict=True)]
+
+
+def _read_summary(folder: Path) -> dict[str, Any]:
+    path = folder / "summary.json"
+    summary = run_folder.read_json(path)
+    if missing := sorted(_NEEDED - summary.keys()):
+        raise UsageError(f"{path}: '{missing[0]}' is missing; the run folder is damaged, restore or repeat the run")
+    if run_folder.read_metrics(folder)["env_steps"].max() > summary["env_steps"]:
+        raise UsageError(f"RUN_DIR {folder}: continued and not finished; finish it with `train --resume`")
+    return summary
 
 
 def _distinct(entry: Entry, alike: Sequence[Entry]) -> Entry:
@@ -128,6 +144,7 @@ def page(
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width, initial-scale=1'>",
+        _PAGE,
         f"<title>{_text(', '.join(tasks))}: imitation under cost constraints</title>",
         f"<style>{_STYLE}</style></head><body>",
         f"<h1>{_text(', '.join(tasks))}: imitation under cost constraints</h1>",
@@ -232,9 +249,10 @@ def _marked(text: str, name: str, beyond_error: bool | None) -> str:
 
 
 def _differences(entries: Sequence[Entry]) -> str:
-    fields = [dataclasses.asdict(e.run.config) for e in entries]
-    differing = [name for name in fields[0] if len({repr(f[name]) for f in fields}) > 1]
-    rows = [[_text(name), *(_text(str(f[name])) for f in fields)] for name in differing]
+    fields = [relevant(e.run.config) for e in entries]  # a run without a field shows a dash
+    names = [name for name in dataclasses.asdict(entries[0].run.config) if any(name in f for f in fields)]
+    differing = [name for name in names if len({repr(f.get(name, "-")) for f in fields}) > 1]
+    rows = [[_text(name), *(_text(str(f.get(name, "-"))) for f in fields)] for name in differing]
     text = _table(["field", *(_text(e.label) for e in entries)], rows) if rows else "<p>All fields are equal.</p>"
     for e in entries:
         facts, demos = e.run.facts, e.run.facts["demonstrations"]
@@ -290,12 +308,28 @@ def choose_seed(entry: Entry) -> tuple[int, str]:
     return best, f"One episode of {entry.label}, seed {best}{why}."
 
 
+def is_page(path: Path) -> bool:
+    """Whether the file was written by this launcher, so that a newer page may take its place."""
+    try:
+        with path.open("rb") as file:
+            return _PAGE.encode() in file.read(500)
+    except OSError:
+        return False
+
+
+def _figure(folder: Path, task: str) -> Path:
+    return folder / f"{Path(task).name}.png"  # a name from a file does not choose the folder
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Reads the runs and writes the page."""
     entries = read_entries(arguments.runs)
     path = arguments.out or (arguments.runs[0] if len(entries) == 1 else Path()) / "report.html"
+    command_line.check_new_file(path, "--out", overwrite=arguments.overwrite or is_page(path))
     command_line.check_writable(path.parent, "--out")
     if arguments.figures:
+        for task in {e.task for e in entries}:
+            command_line.check_new_file(_figure(arguments.figures, task), "--figures", overwrite=arguments.overwrite)
         command_line.check_writable(arguments.figures, "--figures")
     images = draw_tasks(entries)
     player = None if arguments.no_animation else animate
@@ -303,7 +337,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"page    {path}")
     if arguments.figures:
         for task, image in images.items():
-            figure = arguments.figures / f"{Path(task).name}.png"  # a name from a file does not choose the folder
+            figure = _figure(arguments.figures, task)
             figure.write_bytes(image)
             print(f"figure  {figure}")
 

@@ -16,7 +16,7 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
-from ccil_jax.config import Config
+from ccil_jax.config import Config, ConfigError, check_types
 from ccil_jax.history import without_unknown
 from ccil_jax.versions import versions
 from envs.registry import TASKS
@@ -122,7 +122,12 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
         known = {*task.options, "max_episode_steps"}
         facts["env_options"] = {name: value for name, value in facts["env_options"].items() if name in known}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-    return Run(path.parent, Config(**values), facts)
+    config = Config(**values)
+    try:
+        check_types(config)
+    except ConfigError as error:
+        raise UsageError(f"{path}: {error}; the run folder is damaged, restore or repeat the run") from None
+    return Run(path.parent, config, facts)
 
 
 def git_commit() -> str | None:

@@ -24,7 +24,7 @@ import itertools
 import json
 import sys
 import tomllib
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,8 @@ def make_parser() -> Parser:
 
 def read_spec(path: Path) -> dict[str, Any]:
     """The content of a spec, its tables present. Raises `UsageError` if it is missing or not of that form."""
-    loaders = {".toml": tomllib.loads, ".json": json.loads}
+    read_json = functools.partial(json.loads, object_pairs_hook=_without_doubles)
+    loaders: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": read_json}
     if path.suffix not in loaders:
         raise UsageError(f"SPEC {path}: give a file named *.toml or *.json")
     try:
@@ -77,8 +78,21 @@ def read_spec(path: Path) -> dict[str, Any]:
     for table in ("fixed", "grid"):
         if not isinstance(spec[table], dict):
             raise UsageError(f"SPEC {path}: {table}: give a table of fields")
+        fields = [field.replace("-", "_") for field in spec[table]]  # both are the same option
+        for field in fields:
+            if fields.count(field) > 1 or (table == "fixed" and field in spec):
+                raise UsageError(f"SPEC {path}: {table}.{field}: given twice; leave one out")
+        spec[table] = dict(zip(fields, spec[table].values(), strict=True))
     _check_grid(path, spec)
     return spec
+
+
+def _without_doubles(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object; of two entries with one name JSON itself would keep the last."""
+    names = [name for name, _ in pairs]
+    if doubles := [name for name in names if names.count(name) > 1]:
+        raise ValueError(f"'{doubles[0]}' is there twice")
+    return dict(pairs)
 
 
 def _check_grid(path: Path, spec: Mapping[str, Any]) -> None:

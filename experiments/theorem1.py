@@ -24,6 +24,7 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--out", default=Path("theorem1.png"), type=Path, metavar="FILE", help="figure (default: theorem1.png)"
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
     return parser
 
 
@@ -43,6 +44,7 @@ def print_checks(checks: Sequence[Check]) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Computes, prints, draws; status 1 where a claim fails."""
+    command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
     command_line.check_writable(arguments.out.parent, "--out")
     problem = theorem1_checks.make_problem(arguments.seed)
     learners, small = theorem1_checks.bounded_learners(problem), theorem1_checks.distances(problem)

@@ -65,7 +65,10 @@ def make_variant(
     `load` reads a file of demonstrations; a cached one is given where many variants share a file.
     """
     if "demos" in fields:  # a worker may be started elsewhere
-        fields = {**fields, "demos": Path(fields["demos"]).resolve()}
+        try:
+            fields = {**fields, "demos": Path(fields["demos"]).resolve()}
+        except (TypeError, ValueError):
+            raise UsageError(f"--demos {fields['demos']!r}: give the name of a file") from None
     return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, load, alone=alone)
 
 

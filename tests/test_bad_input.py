@@ -93,6 +93,13 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "stray word": ((*TRAIN, "Swimmer"), "Swimmer: unknown; see --help"),
     "not a number": ((*TRAIN, "--gamma", "high"), "--gamma: invalid float value: 'high'"),
     "not an integer": ((*TRAIN, "--num_envs", "1.5"), "--num-envs: invalid integer value: '1.5'"),
+    "a pattern for a folder": (
+        ("train", "--method", "bc", "--env", "Swimmer", "--out", "lr[0.1]"),
+        "--out lr[0.1]: checkpoints cannot be kept below a folder with [ in its name",
+    ),
+    "a report over something else": (("theorem1", "--out", "good.npz"), "--out good.npz: exists; choose another name"),
+    "a benchmark over something else": (("benchmark", "--out", "good.npz"), "--out good.npz: exists; choose another"),
+    "a figure in the place of a folder": (("theorem1", "--out", "full", "--overwrite"), "--out full: is a folder"),
     "a task without contacts": ((*TRAIN, "--contact-cost", "false"), "--contact-cost: Swimmer has no such option"),
     "not a boolean": ((*TRAIN, "--contact-cost", "maybe"), "--contact-cost: 'maybe': give true or false"),
     "not sizes": ((*TRAIN, "--hidden-sizes", "a,b"), "--hidden-sizes: 'a,b': give sizes such as 100,100"),

@@ -249,6 +249,13 @@ def test_what_is_replaced_is_set_aside_whole(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["2", "2.replaced", "2.replaced-2", "3.replaced"]
 
 
+def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path) -> None:
+    """It would commit a step whose arrays are not there."""
+    with pytest.raises(CheckpointError, match=r"run\[0\].*: checkpoints cannot be kept below a folder with \["):
+        Checkpointer(tmp_path / "run[0]" / "checkpoints", IDENTITY)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_full_disk_ends_the_run_now(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before the save, where the space is known to be short; in the save, where it runs out behind our back."""
     with Checkpointer(folder, IDENTITY) as checkpoints:

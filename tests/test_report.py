@@ -427,3 +427,46 @@ def test_a_safety_gym_episode_is_drawn_from_above() -> None:
     circles = [patch for patch in axes.patches if patch.get_gid() is None and hasattr(patch, "radius")]
     assert len(circles) == 8 + 1 + episode.met.sum()
     assert "PointGoal1: 30 steps" in axes.get_title(loc="left")
+
+
+def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """The one line of a report that is refused."""
+    with pytest.raises(SystemExit) as end:
+        report.main([*arguments, "--no-animation"])
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
+
+
+def test_a_report_replaces_nothing_but_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, figure = make_run(tmp_path / "run", "gail"), tmp_path / "figures" / "Swimmer.png"
+    before = (folder / "config.json").read_bytes()
+    assert "config.json: exists; choose another name" in error_of(capsys, str(folder), "--out", f"{folder}/config.json")
+    assert (folder / "config.json").read_bytes() == before
+    assert "--out" in error_of(capsys, str(folder), "--out", str(folder))  # a folder
+    for _ in range(2):  # a page of its own is brought up to date
+        assert report.main([str(folder), "--no-animation"]) == 0
+    assert report.main([str(folder), "--no-animation", "--figures", str(figure.parent)]) == 0
+    assert "Swimmer.png: exists" in error_of(capsys, str(folder), "--figures", str(figure.parent))
+    assert report.main([str(folder), "--no-animation", "--figures", str(figure.parent), "--overwrite"]) == 0
+
+
+def test_a_run_that_goes_on_is_not_reported_as_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = make_run(tmp_path / "run", "gail")
+    metrics = {name: rows[-1:] for name, rows in run_folder.read_metrics(folder).items()}
+    with run_folder.MetricsWriter(folder) as writer:
+        writer.begin({})
+        writer.write(6, {**metrics, "env_steps": metrics["env_steps"] + 6000})
+    assert "continued and not finished; finish it with `train --resume`" in error_of(capsys, str(folder))
+    run_folder.write_json(folder / "summary.json", {"num_seeds": 3})
+    assert "summary.json: 'env_steps' is missing; the run folder is damaged" in error_of(capsys, str(folder))
+
+
+def test_settings_that_a_run_does_not_use_are_shown_as_a_dash(tmp_path: Path) -> None:
+    runs = [make_run(tmp_path / method, method) for method in ("bc", "gail")]
+    entries = report.read_entries(runs)
+    page = report.page(entries, report.draw_tasks(entries))
+    assert "<tr><td>bc_epochs</td><td>200</td><td>-</td></tr>" in page
+    assert "<tr><td>env_steps</td><td>-</td><td>3000000</td></tr>" in page
+    assert "<td>gate</td>" not in page

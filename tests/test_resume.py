@@ -66,8 +66,35 @@ def test_no_step_is_no_step(tmp_path: Path) -> None:
     nothing = train(tmp_path, stop_after=0)
     assert (nothing.env_steps, nothing.metrics) == (0, {})
     assert not (tmp_path / "0").exists()
-    with pytest.raises(ConfigError, match="stop_after -1: must be at least 0"):
+    with pytest.raises(ConfigError, match="stop_after -1: give an integer from 0"):
         train(stop_after=-1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"seed": -1}, "seed -1: give an integer from 0 to 4294967295"),
+        ({"seed": "a"}, "seed 'a': give an integer"),
+        ({"num_seeds": 1.5}, r"num_seeds 1\.5: give an integer from 1"),
+        ({"num_seeds": True}, "num_seeds True: give an integer"),
+        ({"stop_after": 1.5}, r"stop_after 1\.5: give an integer from 0"),
+        ({"one_by_one": "false"}, "one_by_one 'false': give True or False"),
+        ({"resume": True}, "resume True: there is nothing to go on from; give checkpoint_dir"),
+        ({"moved": ("gamma",)}, "moved gamma: for a training that is resumed"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        runner.train(walk_config(method="trpo"), Walk(), **settings)
+    with pytest.raises(ConfigError, match="give at least one configuration"):
+        runner.train_runs([], Walk())
+
+
+def test_a_training_is_not_resumed_to_be_shorter(several: Path, tmp_path: Path) -> None:
+    shutil.copytree(several, tmp_path / "copy")
+    (tmp_path / "copy" / "1").rename(tmp_path / "copy" / "30")  # as if it had gone on for longer than it is asked to
+    with pytest.raises(ConfigError, match=r"env_steps 1280: the training in .* has done 1920; give"):
+        train_several(tmp_path / "copy", resume=True)
 
 
 def test_what_took_no_step_has_nothing_to_save(tmp_path: Path) -> None:
@@ -115,6 +142,7 @@ def other_demonstrations() -> Demonstrations:
         ({"rates": (0.01,)}, "written with number of configurations 2, this run has 1"),
         ({"rates": (0.01, 0.03), "moved": ("critic_learning_rate",)}, ""),
         ({"moved": ("hidden_sizes",)}, "moved hidden_sizes: only a traced field may differ"),
+        ({"seed": 2**32}, "seed 4294967296: give an integer from 0"),
     ],
 )
 def test_another_training_is_not_resumed(several: Path, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
