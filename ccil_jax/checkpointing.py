@@ -20,7 +20,7 @@ import orbax.checkpoint as ocp
 
 from ccil_jax import digests
 from ccil_jax.digests import CheckpointError, DamageError, Identity
-from ccil_jax.files import DISK_IS_FULL
+from ccil_jax.files import DISK_IS_FULL, unfit_for_checkpoints
 from ccil_jax.types import PyTree
 from envs.base import numbers
 
@@ -50,7 +50,8 @@ class Checkpointer:
         readonly: bool = False,
     ) -> None:
         self._directory = Path(directory).resolve()  # orbax fails in the background on a relative path
-        check_path(self._directory)
+        if complaint := unfit_for_checkpoints(self._directory):
+            raise CheckpointError(f"{self._directory}: {complaint}")
         self._identity, self._free, self._readonly = identity, free | _FREE, readonly
         handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
         with _warnings_of_orbax(logging.ERROR if readonly else logging.NOTSET):  # it warns of what was asked for
@@ -106,9 +107,9 @@ class Checkpointer:
         self._manager.reload()
 
     def check_identity(self, step: int) -> None:
-        """Raises `CheckpointError` where the step is of another training; reads no array, so it is quickly done."""
+        """Raises `CheckpointError` where the step is of another training; only the manifest is read."""
         folder = self._directory / str(step)
-        digests.check_identity(folder, digests.read(folder), self._identity, self._free)
+        digests.check_identity(folder, digests.read_manifest(folder), self._identity, self._free)
 
     def check_empty(self) -> None:
         """Raises `CheckpointError` where there are steps already, which a new training would mix with its own."""
@@ -145,15 +146,11 @@ class Checkpointer:
         if free < needed:
             raise CheckpointError(self._no_space(folder, needed, free))
         try:
-            if not self._manager.save(step, args=ocp.args.StandardSave(state)):  # it says no in silence
-                raise CheckpointError(
-                    f"{folder}: not saved, as {self._directory} holds a later step; choose another folder"
-                )
+            saved = self._manager.save(step, args=ocp.args.StandardSave(state))
             # Waiting costs little and tells of a failure now, not one save later.
             self._manager.wait_until_finished()
-            digests.write(folder, state, self._identity)
-        except CheckpointError:
-            raise
+            if saved:
+                digests.write(folder, state, self._identity)
         except (OSError, ValueError, RuntimeError) as error:  # TensorStore reports the system's errors as ValueError
             if _is_disk_error(error):
                 free = shutil.disk_usage(self._directory).free
@@ -161,6 +158,10 @@ class Checkpointer:
             raise CheckpointError(
                 f"{folder}: cannot be written ({_first_line(error)}); see to the disk and resume"
             ) from error
+        if not saved:  # orbax says no in silence
+            raise CheckpointError(
+                f"{folder}: not saved, as {self._directory} holds a later step; choose another folder"
+            )
 
     def _no_space(self, folder: Path, needed: int, free: int) -> str:
         kept = ", ".join(str(step) for step in self._manager.all_steps() if step != int(folder.name)) or "none"
@@ -194,12 +195,6 @@ class Checkpointer:
     def close(self) -> None:
         """Frees the manager's threads. No save is in flight."""
         self._manager.close()
-
-
-def check_path(path: Path) -> None:
-    """Raises `CheckpointError` for a path that orbax takes for a pattern: it would lose what is saved there."""
-    if "[" in str(path):
-        raise CheckpointError(f"{path}: checkpoints cannot be kept below a folder with [ in its name; choose another")
 
 
 @contextlib.contextmanager

@@ -415,9 +415,9 @@ def check_types(config: Config) -> None:
         if isinstance(default, bool):
             sound, wanted = isinstance(value, bool), "True or False"
         elif isinstance(default, tuple):
-            sound, wanted = isinstance(value, tuple) and all(map(_is_integer, value)), "a tuple such as (100, 100)"
+            sound, wanted = isinstance(value, tuple) and all(map(is_integer, value)), "a tuple such as (100, 100)"
         elif isinstance(default, int):
-            sound, wanted = _is_integer(value), "an integer"
+            sound, wanted = is_integer(value), "an integer"
         else:
             sound, wanted = _is_number(value) or (value is None and default is None), "a number"
         if not sound:
@@ -434,7 +434,8 @@ def _is_number(value: Any) -> bool:
     return True
 
 
-def _is_integer(value: Any) -> bool:
+def is_integer(value: Any) -> bool:
+    """Whether the value is an integer of Python or NumPy, and no boolean."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool)
 
 
@@ -448,7 +449,7 @@ def validate(config: Config) -> None:
     resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
     check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))
     for name, default in _DEFAULTS.items():
-        if _is_integer(default) and getattr(config, name) < 1:
+        if is_integer(default) and getattr(config, name) < 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
         raise ConfigError(f"--hidden_sizes {config.hidden_sizes}: give at least one layer of at least one unit")

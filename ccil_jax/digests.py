@@ -104,8 +104,8 @@ def write(folder: Path, state: PyTree, identity: Identity | None) -> None:
     temporary.replace(folder / NAME)
 
 
-def read(folder: Path) -> dict[str, Any]:
-    """The manifest of an intact step: every file is there and as it was written. Raises `DamageError`."""
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a step, whose other files are not looked at. Raises `DamageError` if it is not intact."""
     path = folder / NAME
     try:
         content = json.loads(path.read_bytes())
@@ -114,6 +114,13 @@ def read(folder: Path) -> dict[str, Any]:
         raise DamageError(f"{path}: missing or damaged") from None
     if sha256 != _sha256(content):
         raise DamageError(f"{path}: damaged; it disagrees with its own digest")
+    plain: dict[str, Any] = content
+    return plain
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """The manifest of an intact step: every file is there and as it was written. Raises `DamageError`."""
+    content = read_manifest(folder)
     present = {str(file.relative_to(folder)): file for file in _files(folder)}
     for name, expected in content["files"].items():
         if name not in present:

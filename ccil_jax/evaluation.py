@@ -126,9 +126,7 @@ def evaluate(
     """
     if num_episodes < 1:
         raise ValueError(f"num_episodes {num_episodes}: must be at least 1")
-    numbers = range(len(jax.tree.leaves(actor)[0])) if draws is None else draws
-    draw = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
-    keys = draw(jax.random.key(seed), jnp.asarray(numbers, jnp.uint32))
+    keys = _keys(seed, range(len(jax.tree.leaves(actor)[0])) if draws is None else draws)
 
     def run(runs: tuple[Actor, jax.Array]) -> Evaluation:
         actor, key = runs
@@ -146,8 +144,13 @@ def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) ->
     def run(key: jax.Array) -> Evaluation:
         return _totals(run_episodes(env, _uniform(env), 1, key))
 
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(padded, dtype=jnp.uint32))
-    return jax.tree.map(lambda rows: np.asarray(rows)[:num_episodes].T, _spread(run, keys))
+    return jax.tree.map(lambda rows: np.asarray(rows)[:num_episodes].T, _spread(run, _keys(seed, range(padded))))
+
+
+def _keys(seed: int, numbers: Sequence[int]) -> jax.Array:
+    """A random key for each number; it follows from the number and `seed` alone."""
+    fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
+    return fold_in(jax.random.key(seed), jnp.asarray(numbers, jnp.uint32))
 
 
 def _spread(run: Callable[[Any], Any], runs: PyTree) -> Any:

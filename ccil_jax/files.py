@@ -14,6 +14,16 @@ from ccil_jax.config import ConfigError
 DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # or a quota, or the largest file that may be
 
 
+def unfit_for_checkpoints(path: Path) -> str | None:
+    """What is wrong with a folder below which checkpoints are to be kept; None if nothing is.
+
+    Orbax takes a path with [ for a pattern, and commits a step whose arrays are not there.
+    """
+    if "[" not in str(path.resolve()):
+        return None
+    return "checkpoints cannot be kept below a folder with [ in its name; choose another"
+
+
 class LockedError(ConfigError):
     """A folder that another process writes to. The message names both."""
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import numbers
 import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 
 from ccil_jax import files, guard, iq_learn
 from ccil_jax.checkpointing import Checkpointer
-from ccil_jax.config import Config, ConfigError, field_names, validate, with_limit_of
+from ccil_jax.config import Config, ConfigError, field_names, is_integer, validate, with_limit_of
 from ccil_jax.demonstrations import Demonstrations, check_time_limit
 from ccil_jax.digests import CheckpointError, Identity, identity_of
 from ccil_jax.guard import GuardedState
@@ -86,8 +85,8 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
             ("actions", demonstrations.actions, env.action_dim),
         ):
             if array.shape[1:] != (size,):
-                columns_found = array.shape[1] if array.ndim == 2 else f"shape {array.shape}, not rows of"
-                raise ConfigError(f"demonstrations: {name} has {columns_found} columns but {env.name} has {size}")
+                found = f"{array.shape[1]} columns" if array.ndim == 2 else f"shape {array.shape}, no rows,"
+                raise ConfigError(f"demonstrations: {name} has {found} but {env.name} has {size}")
         check_time_limit(demonstrations, "demonstrations", env.max_episode_steps)
     if demonstrations is not None:
         config = with_limit_of(config, demonstrations.mean_episode_cost)
@@ -323,8 +322,7 @@ def train_runs(
 
 
 def _check_integer(name: str, value: Any, least: int, most: int = 2**31 - 1) -> None:
-    is_integer = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    if not (is_integer and least <= int(value) <= most):
+    if not (is_integer(value) and least <= int(value) <= most):
         raise ConfigError(f"{name} {value!r}: give an integer from {least} to {most}")
 
 

@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 from ccil_jax.config import ConfigError
 from ccil_jax.demonstrations import DemonstrationsError
-from ccil_jax.files import DISK_IS_FULL
+from ccil_jax.files import DISK_IS_FULL, unfit_for_checkpoints
 from experiments import devices
 
 CONSOLE = "ccil"  # the command that an installation brings along; `experiments.console` carries it out
@@ -175,10 +175,8 @@ def check_output_folder(
         raise UsageError(f"{option} {folder}: already holds a run; continue it with --resume or choose another folder")
     if occupied and not resume:
         raise UsageError(f"{option} {folder}: not empty; choose a new folder")
-    if "[" in str(folder.resolve()):  # see `ccil_jax.checkpointing.check_path`
-        raise UsageError(
-            f"{option} {folder}: checkpoints cannot be kept below a folder with [ in its name; choose another"
-        )
+    if complaint := unfit_for_checkpoints(folder):
+        raise UsageError(f"{option} {folder}: {complaint}")
     check_writable(folder, option)
 
 

@@ -188,12 +188,13 @@ def evaluate_run(
         evaluated = original.evaluate(
             loaded.config, loaded.agent, env, draws=draws, contact_cost=contact_cost, **settings
         )
+    provenance = run_folder.provenance()
     facts = {
         "task": env.name,
         "original": TASKS[env.name].original,
         "simulator": arguments.simulator,
         **recorded,
-        **run_folder.provenance(),
+        **provenance,
     }
     for file in arguments.export:
         if file.suffix == ".npz":
@@ -219,7 +220,7 @@ def evaluate_run(
         "run": str(stored.folder.resolve()),
         "simulator": arguments.simulator,
         **recorded,
-        **run_folder.provenance(),
+        **provenance,
         **dataclasses.asdict(reference),
         "per_seed": rows,
         "aggregate": summary.aggregate_scores(rows),

@@ -90,6 +90,12 @@ def test_settings_that_mean_nothing_are_refused(settings: dict[str, Any], messag
         runner.train_runs([], Walk())
 
 
+def test_demonstrations_without_rows_are_refused() -> None:
+    flat = dataclasses.replace(walk_demonstrations(), actions=walk_demonstrations().actions[:, 0])
+    with pytest.raises(ConfigError, match=r"demonstrations: actions has shape \(40,\), no rows, but Walk has 1"):
+        runner.resolve(walk_config(method="gail"), Walk(), flat)
+
+
 def test_a_training_is_not_resumed_to_be_shorter(several: Path, tmp_path: Path) -> None:
     shutil.copytree(several, tmp_path / "copy")
     (tmp_path / "copy" / "1").rename(tmp_path / "copy" / "30")  # as if it had gone on for longer than it is asked to
