@@ -15,7 +15,7 @@ PACKAGES = ("ccil_jax", "envs", "experiments")
 def main() -> int:
     """Carries out the command line; returns the exit status."""
     load_packages(Path(__file__).parent)
-    from experiments import console
+    from experiments.cli import console
 
     return console.main()
 

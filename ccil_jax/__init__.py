@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ccil_jax.acting.evaluation import evaluate
     from ccil_jax.config import Config
-    from ccil_jax.demonstrations import Demonstrations, load_demonstrations, save_demonstrations
-    from ccil_jax.evaluation import evaluate
+    from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations, save_demonstrations
     from ccil_jax.methods import METHODS
-    from ccil_jax.runner import Result, train, train_runs
+    from ccil_jax.training.runner import Result, train, train_runs
 
 __version__ = "0.1.0"
 
@@ -47,14 +47,14 @@ if Path(str(_found)).resolve() != _needed:
 
 _HOMES = {
     "Config": "ccil_jax.config",
-    "Demonstrations": "ccil_jax.demonstrations",
-    "load_demonstrations": "ccil_jax.demonstrations",
-    "save_demonstrations": "ccil_jax.demonstrations",
-    "evaluate": "ccil_jax.evaluation",
+    "Demonstrations": "ccil_jax.demonstrations.trajectories",
+    "load_demonstrations": "ccil_jax.demonstrations.trajectories",
+    "save_demonstrations": "ccil_jax.demonstrations.trajectories",
+    "evaluate": "ccil_jax.acting.evaluation",
     "METHODS": "ccil_jax.methods",
-    "Result": "ccil_jax.runner",
-    "train": "ccil_jax.runner",
-    "train_runs": "ccil_jax.runner",
+    "Result": "ccil_jax.training.runner",
+    "train": "ccil_jax.training.runner",
+    "train_runs": "ccil_jax.training.runner",
 }
 
 

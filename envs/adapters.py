@@ -16,7 +16,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envs.base import State, check_shape, compute_where, executed, first_state, next_state
+from envs.base import State, check_shape, executed, first_state, next_state
+from envs.jax_tools import compute_where
 from envs.registry import check_count
 
 BraxState = Any

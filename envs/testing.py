@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import State, numbers
+from envs.base import State
+from envs.jax_tools import numbers
 
 
 def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:

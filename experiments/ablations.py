@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import PRESETS, Config, check_used, unused
-from ccil_jax.demonstrations import load_demonstrations
-from experiments import command_line, comparison, options, study, train
-from experiments.command_line import Parser, UsageError
-from experiments.comparison import Row
-from experiments.variants import Variant, make_variant
+from ccil_jax.demonstrations.trajectories import load_demonstrations
+from experiments import train
+from experiments.cli import command_line, options
+from experiments.cli.command_line import Parser, UsageError
+from experiments.sweeps import comparison, dispatch
+from experiments.sweeps.comparison import Row
+from experiments.sweeps.variants import Variant, make_variant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,7 +114,7 @@ def make_parser() -> Parser:
         metavar="NAME",
         help=f"of {', '.join(QUESTIONS)} (default: all)",
     )
-    study.add_options(parser)
+    dispatch.add_options(parser)
     train.add_options(parser, with_method=False)
     return parser
 
@@ -182,12 +184,12 @@ def run(arguments: argparse.Namespace) -> int:
     answers = ask(arguments.questions, shared, arguments.out)
     different = list({variant.name: variant for variant in answers.values()}.values())
     choices = {name: str(value) for name, value in shared.items()}
-    num_failed = study.carry_out(different, arguments, "ablations.json", choices)
+    num_failed = dispatch.carry_out(different, arguments, "ablations.json", choices)
     rows = rows_of(answers)
     if not rows:
         raise UsageError(f"--out {arguments.out}: no variant was finished; see the worker.log of each program there")
     comparison.write_csv(arguments.out / "ablations.csv", rows)
-    from experiments import comparison_figures  # imports matplotlib
+    from experiments.sweeps import comparison_figures  # imports matplotlib
 
     figure = arguments.out / "ablations.png"
     seeds = f"{rows[0]['num_seeds']} seeds, {rows[0]['env_steps']:,} steps each"

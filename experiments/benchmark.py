@@ -17,11 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import CHOICES, PRESETS, Config
-from ccil_jax.versions import versions
+from ccil_jax.training.versions import versions
 from envs.registry import PHYSICS
-from experiments import command_line, devices, interruption, options, peers, run_folder, workers
-from experiments.command_line import Parser, UsageError
-from experiments.summary import show
+from experiments.cli import command_line, interruption, options, xla
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import run_folder
+from experiments.runs.summary import show
+from experiments.speed import peers
+from experiments.sweeps import backends
 
 _LEAST_STEPS = 16  # of each simulation in a batch
 
@@ -120,7 +123,7 @@ def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: 
     """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
     command = [sys.executable, "-P", "-m", f"experiments.{launcher}", *options, "--row", json.dumps(setting)]
     # The compilation is measured, so nothing may come from a cache.
-    environment = {**os.environ, "PYTHONPATH": workers.python_path(), "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    environment = {**os.environ, "PYTHONPATH": backends.python_path(), "JAX_ENABLE_COMPILATION_CACHE": "false"}
     if setting.get("turns"):  # an accelerator's memory is shared
         environment.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     ears, mouth = os.pipe()  # they close with this process, and then the row ends too
@@ -137,7 +140,7 @@ def begin_row(text: str) -> dict[str, Any]:
     """In a row's own process: the setting that `measure_row` gave it, once this process is as training's would be."""
     interruption.stop_at_eof()
     setting: dict[str, Any] = json.loads(text)
-    devices.spread_seeds(setting["num_seeds"])
+    xla.spread_seeds(setting["num_seeds"])
     return setting
 
 
@@ -224,10 +227,10 @@ def run(arguments: argparse.Namespace) -> None:
     """Measures all rows, prints and writes them."""
     if arguments.row is not None:
         setting = begin_row(arguments.row)
-        from experiments import measuring  # imports JAX
+        from experiments.speed import measuring  # imports JAX
 
         if arguments.profile:
-            from experiments import profiling
+            from experiments.speed import profiling
 
             print(json.dumps(profiling.profile(measuring.Setting(**setting))))
         else:

@@ -10,9 +10,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ccil_jax.demonstrations import Demonstrations, check_matches, load_demonstrations, save_demonstrations
-from experiments import command_line, options
-from experiments.command_line import Parser, UsageError
+from ccil_jax.demonstrations.trajectories import Demonstrations, check_matches, load_demonstrations, save_demonstrations
+from experiments.cli import command_line, options
+from experiments.cli.command_line import Parser, UsageError
 
 
 def make_parser() -> Parser:

@@ -12,11 +12,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.demonstrations import save_demonstrations
+from ccil_jax.demonstrations.trajectories import save_demonstrations
 from envs.registry import TASKS
-from experiments import command_line, devices, evaluations, recording, run_folder, summary
-from experiments.command_line import Parser, UsageError
-from experiments.run_folder import Run
+from experiments.cli import command_line, xla
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import evaluations, recording, run_folder, summary
+from experiments.runs.run_folder import Run
 
 _NUM_TRAJECTORIES = 10  # to record, unless said otherwise
 
@@ -168,10 +169,11 @@ def evaluate_run(
     Returns the entry for the result file and the levels to compare with.
     """
     import envs  # imports JAX: not before the input has been checked
-    from ccil_jax import evaluation, runner
-    from experiments import exporting, original
+    from ccil_jax.acting import evaluation
+    from ccil_jax.training import runner
+    from experiments.policies import exporting, original_simulator
 
-    devices.spread_seeds(stored.facts["num_seeds"])
+    xla.spread_seeds(stored.facts["num_seeds"])
     env = envs.make(stored.facts["task"], physics=stored.facts["physics"], **stored.facts["env_options"])
     loaded = runner.load(stored.config, env, stored.folder.resolve() / "checkpoints", stored.facts["num_seeds"])
     settings: dict[str, Any] = {
@@ -185,7 +187,7 @@ def evaluate_run(
         evaluated: Any = evaluation.evaluate(loaded.config, loaded.agent, env, draws=draws, **settings)
     else:
         contact_cost = stored.facts["env_options"].get("contact_cost", True)
-        evaluated = original.evaluate(
+        evaluated = original_simulator.evaluate(
             loaded.config, loaded.agent, env, draws=draws, contact_cost=contact_cost, **settings
         )
     provenance = run_folder.provenance()

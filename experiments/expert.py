@@ -13,12 +13,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.demonstrations import save_demonstrations
-from experiments import command_line, options, run_folder
-from experiments.command_line import Parser, UsageError
-from experiments.recording import choose_seed, facts, print_demonstrations, record
-from experiments.resuming import resumed
-from experiments.training import Plan, execute
+from ccil_jax.demonstrations.trajectories import save_demonstrations
+from experiments.cli import command_line, options
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import run_folder
+from experiments.runs.execution import Plan, execute
+from experiments.runs.recording import choose_seed, facts, print_demonstrations, record
+from experiments.runs.resuming import resumed
 
 PRESETS = {"locomotion": "expert", "safety_gym": "safety_gym_expert"}  # of each family
 DEFAULTS = {**options.DEFAULTS, "preset": PRESETS["locomotion"]}

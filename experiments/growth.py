@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.config import CHOICES
-from experiments import benchmark, command_line, options, run_folder
-from experiments.command_line import Parser
-from experiments.summary import show
+from experiments import benchmark
+from experiments.cli import command_line, options
+from experiments.cli.command_line import Parser
+from experiments.runs import run_folder
+from experiments.runs.summary import show
 
 DEMONSTRATIONS = 10_000  # steps, where they do not vary
 AXES: Mapping[str, tuple[int, ...]] = {
@@ -140,7 +142,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Measures all points, prints, draws and writes them."""
     if arguments.row is not None:
         setting = benchmark.begin_row(arguments.row)
-        from experiments import measuring  # imports JAX
+        from experiments.speed import measuring  # imports JAX
 
         print(json.dumps(measuring.measure_training(measuring.Setting(**setting))))
         return

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.demonstrations import Demonstrations, load_demonstrations
-from ccil_jax.files import file_sha256
-from ccil_jax.npz import ArchiveError
-from experiments import command_line, faults, run_folder
-from experiments.command_line import Parser, UsageError
+from ccil_jax.demonstrations.npz import ArchiveError
+from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
+from ccil_jax.training.filesystem import file_sha256
+from experiments.cli import command_line
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import fault_files, run_folder
 
 
 def make_parser() -> Parser:
@@ -33,18 +34,19 @@ def run(arguments: argparse.Namespace) -> int:
 
 def replay(path: Path, demos: Path | None = None) -> list[str]:
     """One unguarded iteration from the state in `path`: names of the metrics and parts of the state not finite."""
-    run = run_folder.parse_run(path, faults.read_facts(path))
+    run = run_folder.parse_run(path, fault_files.read_facts(path))
     demonstrations = _demonstrations(run.facts["demonstrations"], demos)
 
     import jax
 
     import envs
-    from ccil_jax import agents, guard, runner
+    from ccil_jax.agents import build
+    from ccil_jax.training import guard, runner
 
     env = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
     config = runner.resolve(run.config, env, demonstrations)
-    agent = agents.make(config, env, runner.expert_data(demonstrations))
-    state = faults.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))
+    agent = build.make(config, env, runner.expert_data(demonstrations))
+    state = fault_files.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))
     state, metrics = jax.jit(agent.step)(state)
     return [*guard.not_finite({"metrics": metrics}), *guard.not_finite({"state": state})]
 

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.config import relevant
-from experiments import command_line, run_folder
-from experiments.command_line import Parser, UsageError
-from experiments.labels import distinct_names
-from experiments.run_folder import Run
-from experiments.statistics import bootstrap_interval
-from experiments.summary import BEYOND_ERROR, bounds, marked, number
+from experiments.cli import command_line
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import run_folder
+from experiments.runs.intervals import bootstrap_interval
+from experiments.runs.labels import distinct_names
+from experiments.runs.run_folder import Run
+from experiments.runs.summary import BEYOND_ERROR, bounds, marked, number
 
 _NEEDED = {"num_seeds", "per_seed", "env_steps", "env_steps_per_second", "expert_cost"}  # of summary.json
 _COLUMNS = (
@@ -124,7 +125,7 @@ def _distinct(entry: Entry, alike: Sequence[Entry]) -> Entry:
 
 def draw_tasks(entries: Sequence[Entry]) -> dict[str, bytes]:
     """The learning curves of each task, all runs overlaid: bytes of a PNG file by task, in the order of the runs."""
-    from experiments import figures  # imports matplotlib
+    from experiments.runs import figures  # imports matplotlib
 
     curves: dict[str, list[figures.Curve]] = {}
     for e in entries:
@@ -160,7 +161,7 @@ def page(
 def _task_section(
     task: str, entries: Sequence[Entry], image: bytes, seed: int, player: Callable[[Entry], str] | None
 ) -> Iterable[str]:
-    from experiments import figures  # imports matplotlib
+    from experiments.runs import figures  # imports matplotlib
 
     yield f"<h2>{_text(task)}</h2>"
     several = any(len(e.summary["per_seed"]) > 1 for e in entries)
@@ -294,7 +295,7 @@ def animate(entry: Entry) -> str:
     """The HTML of an episode of the seed with the highest return, or an empty string for a run without checkpoints."""
     if not (entry.run.folder / "checkpoints").is_dir():
         return ""
-    from experiments import animation  # imports JAX: only where an episode is asked for
+    from experiments.page import animation  # imports JAX: only where an episode is asked for
 
     best, caption = choose_seed(entry)
     return animation.play_run(entry.run, best, f"episode-{entry.number}", caption)

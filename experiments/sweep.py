@@ -29,10 +29,11 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import ConfigError
-from ccil_jax.demonstrations import DemonstrationsError, load_demonstrations
-from experiments import command_line, comparison, study
-from experiments.command_line import Parser, UsageError
-from experiments.variants import Variant, make_variant, run_of, text
+from ccil_jax.demonstrations.trajectories import DemonstrationsError, load_demonstrations
+from experiments.cli import command_line
+from experiments.cli.command_line import Parser, UsageError
+from experiments.sweeps import comparison, dispatch
+from experiments.sweeps.variants import Variant, make_variant, run_of, text
 
 _KEYS = ("env", "method", "fixed", "grid")
 _LONGEST_NAME = 120  # of a folder
@@ -50,7 +51,7 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("sweep", __doc__ or "")
     parser.add_argument("spec", type=Path, metavar="SPEC", help="TOML or JSON file that names what to train")
-    study.add_options(parser)
+    dispatch.add_options(parser)
     return parser
 
 
@@ -139,7 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Trains what is missing, then writes sweep.csv and sweep.png; status 1 if a program failed."""
     spec = read_spec(arguments.spec)
     found = variants_of(arguments.spec, spec, arguments.out)
-    num_failed = study.carry_out([variant for variant, _ in found.values()], arguments, "sweep.json", spec)
+    num_failed = dispatch.carry_out([variant for variant, _ in found.values()], arguments, "sweep.json", spec)
     rows = [
         {**{field: text(value) for field, value in point.items()}, **comparison.row(variant)}
         for variant, point in found.values()
@@ -149,7 +150,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--out {arguments.out}: no variant was finished; see the worker.log of each program there")
     table, figure = arguments.out / "sweep.csv", arguments.out / "sweep.png"
     comparison.write_csv(table, rows)
-    from experiments import comparison_figures  # imports matplotlib
+    from experiments.sweeps import comparison_figures  # imports matplotlib
 
     groups = {task: [row for row in rows if row["task"] == task] for task in dict.fromkeys(r["task"] for r in rows)}
     title = "interquartile mean and 95 % interval over seeds, dots: seeds"

@@ -11,10 +11,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments import command_line, theorem1_checks
-from experiments.command_line import Parser
-from experiments.summary import show
-from experiments.theorem1_checks import Check
+from experiments.cli import command_line
+from experiments.cli.command_line import Parser
+from experiments.runs.summary import show
+from experiments.theory import theorem1_checks
+from experiments.theory.theorem1_checks import Check
 
 
 def make_parser() -> Parser:
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
         *theorem1_checks.check_methods(problem, ccil, cvag, settled),
     ]
     print_checks(checks)
-    from experiments import theorem1_figure  # imports matplotlib: no argument error should wait for it
+    from experiments.theory import theorem1_figure  # imports matplotlib: no argument error should wait for it
 
     theorem1_figure.draw(arguments.out, problem, learners, small, ccil, cvag, settled)
     print(f"figure  {arguments.out}")

@@ -9,13 +9,13 @@ from types import MappingProxyType
 from typing import Any
 
 from ccil_jax.config import Config, with_limit_of
-from ccil_jax.demonstrations import Demonstrations, check_matches, check_time_limit, load_demonstrations
+from ccil_jax.demonstrations.trajectories import Demonstrations, check_matches, check_time_limit, load_demonstrations
 from ccil_jax.methods import METHODS
 from envs.registry import TaskInfo
-from experiments import command_line, options
-from experiments.command_line import Parser, UsageError
-from experiments.resuming import resumed
-from experiments.training import Plan, execute
+from experiments.cli import command_line, options
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs.execution import Plan, execute
+from experiments.runs.resuming import resumed
 
 
 def make_parser() -> Parser:

@@ -15,7 +15,7 @@ import jaxtyping
 import pytest
 from hypothesis import settings
 
-from experiments import devices
+from experiments.cli import xla
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ccil_jax" / "tests"
 ENVIRONMENT = {  # read when the packages are imported, here and in the tests' subprocesses
@@ -30,19 +30,19 @@ ENVIRONMENT = {  # read when the packages are imported, here and in the tests' s
 assert "jax" not in sys.modules, "imported too early to be set"
 for variable, value in ENVIRONMENT.items():
     os.environ.setdefault(variable, value)
-devices.widen_vectors()  # as in launchers, whose results some tests compare with those of this process
+xla.widen_vectors()  # as in launchers, whose results some tests compare with those of this process
 
 # The first call of a jitted function compiles, so no example has a deadline. The same examples on every run.
 settings.register_profile("tests", deadline=None, derandomize=True)
 settings.load_profile("tests")
 
 CHECKED = (  # modules of functions on arrays; shapes must agree across the arguments and the result of each call
-    "ccil_jax.constraints",
-    "ccil_jax.distributions",
-    "ccil_jax.regression",
-    "ccil_jax.returns",
-    "ccil_jax.running_statistics",
-    "ccil_jax.trust_region",
+    "ccil_jax.learning.constraints",
+    "ccil_jax.acting.distributions",
+    "ccil_jax.learning.regression",
+    "ccil_jax.learning.returns",
+    "ccil_jax.acting.running_statistics",
+    "ccil_jax.learning.trust_region",
 )
 # An int passes for a float, as it does for mypy.
 TYPECHECKER = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))

@@ -82,7 +82,7 @@ class Suite:
     """Runs below one scratch folder, with one compilation cache."""
 
     def __init__(self, scratch: Path, seed: int = 0) -> None:
-        from ccil_jax.demonstrations import save_demonstrations
+        from ccil_jax.demonstrations.trajectories import save_demonstrations
         from tests.probe_envs import walk_demonstrations
 
         self.scratch = scratch
@@ -327,7 +327,7 @@ def child(launcher: str, arguments: Sequence[str]) -> int:
     envs.TASKS = registry.TASKS = {**registry.TASKS, "Walk": walk}  # type: ignore[misc]
     envs._FAMILIES["probe"] = ("tests.faults", "make_walk")
 
-    from ccil_jax import runner
+    from ccil_jax.training import runner
 
     runner.CHECKPOINT_SECONDS, runner.SAVING_SHARE, runner.CHUNK_SECONDS = 0.3, 1.0, 0.0
     for number in (signal.SIGTERM, signal.SIGUSR1):  # sent here, even if whoever runs this began with them ignored

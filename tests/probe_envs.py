@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from ccil_jax import networks
+from ccil_jax.acting import networks
 from ccil_jax.config import Config
-from ccil_jax.demonstrations import Demonstrations
+from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.types import Batch, PyTree
-from envs.base import State, first_state, next_state, numbers
+from envs.base import State, first_state, next_state
+from envs.jax_tools import numbers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,11 @@ import pytest
 
 from ccil_jax.config import Config, validate
 from ccil_jax.methods import METHODS
-from experiments import ablations, comparison, comparison_figures, run_folder, variants
+from experiments import ablations
 from experiments.ablations import QUESTIONS
-from experiments.comparison import Row, multiplier_path
+from experiments.runs import run_folder
+from experiments.sweeps import comparison, comparison_figures, variants
+from experiments.sweeps.comparison import Row, multiplier_path
 
 SHARED = {"env": "Swimmer"}
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ccil_jax.config import Config
-from ccil_jax.demonstrations import Demonstrations, save_demonstrations
+from ccil_jax.demonstrations.trajectories import Demonstrations, save_demonstrations
 
 PROBE = """
 import sys

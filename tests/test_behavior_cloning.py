@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import behavior_cloning, runner
-from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.running_statistics import normalize
+from ccil_jax.acting.running_statistics import normalize
+from ccil_jax.agents import behavior_cloning
+from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.training import runner
 from tests.probe_envs import Walk, numpy_policy, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 SLOPE, STD = np.array([0.5, -0.3]), 0.2

@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
-from experiments import benchmark, growth, peers
-from experiments.command_line import UsageError
-from experiments.peers import Peer
-from experiments.turns import turn
+from experiments import benchmark, growth
+from experiments.cli.command_line import UsageError
+from experiments.speed import peers
+from experiments.speed.peers import Peer
+from experiments.speed.turns import turn
 from tests.processes import command_lines, in_proc
 
 SCRIPT = """

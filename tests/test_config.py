@@ -12,11 +12,12 @@ import pytest
 from jax.extend.core import Jaxpr, Literal
 from jax.interpreters import partial_eval
 
-from ccil_jax import agents, runner
+from ccil_jax.agents import build
 from ccil_jax.config import PRESETS, Config, ConfigError, field_names, unused, validate, with_limit_of
 from ccil_jax.methods import METHODS
+from ccil_jax.training import runner
 from experiments import ablations, expert, sweep, train
-from experiments.command_line import UsageError
+from experiments.cli.command_line import UsageError
 from tests.probe_envs import Walk, walk_config, walk_demonstrations
 
 # Who uses what ------------------------------------------------------------------------------------------------------
@@ -64,7 +65,7 @@ def policy_program(config: Config) -> tuple[Any, list[bool]]:
     demonstrations = runner.expert_data(walk_demonstrations())
 
     def train(values: dict[str, jax.Array]) -> Any:
-        agent = agents.make(config.replace(**values), Walk(), demonstrations)
+        agent = build.make(config.replace(**values), Walk(), demonstrations)
         start = agent.init(jax.random.key(0))
         return jax.lax.scan(lambda state, _: (agent.step(state)[0], None), start, None, length=4)[0].actor
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import ccil_jax
-from experiments import command_line, console
+from experiments.cli import command_line, console
 
 ROOT = Path(__file__).parent.parent
 SCRIPT = f"""#!{sys.executable}
@@ -47,7 +47,7 @@ def script(tmp_path: Path) -> Path:
 
 
 def test_the_overview_lists_every_launcher(capsys: pytest.CaptureFixture[str]) -> None:
-    known = "ablations benchmark convert evaluate expert growth replay_fault report sweep sweep_worker theorem1 train"
+    known = "ablations benchmark convert evaluate expert growth replay_fault report sweep theorem1 train"
     assert [*console.launchers()] == known.split()
     for arguments in ([], ["--help"], ["-h"]):
         assert console.main(arguments) == 0
@@ -116,7 +116,7 @@ AWKWARD = ["--out", "my runs/it's $HOME", '"', "*", "a\\b", ""]
 
 
 def test_a_recorded_command_repeats_itself_in_a_shell(tmp_path: Path) -> None:
-    code = "import sys; from experiments.command_line import command; print(sys.argv[1:]); print(command())"
+    code = "import sys; from experiments.cli.command_line import command; print(sys.argv[1:]); print(command())"
     first = python("-c", code, *AWKWARD, cwd=tmp_path)
     given, command = first.stdout.splitlines()
     assert given == str(AWKWARD)

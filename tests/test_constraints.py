@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from ccil_jax import constraints, policy_step
-from ccil_jax.agents import AGENTS
+from ccil_jax.agents.build import AGENTS
 from ccil_jax.config import Config
-from ccil_jax.constraints import Episodes
+from ccil_jax.learning import constraints, policy_step
+from ccil_jax.learning.constraints import Episodes
 from ccil_jax.methods import METHODS
 from ccil_jax.types import PyTree
 from tests.probe_envs import policy_problem

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccil_jax.demonstrations import (
+from ccil_jax.demonstrations.trajectories import (
     Demonstrations,
     DemonstrationsError,
     check_matches,
@@ -19,7 +19,7 @@ from ccil_jax.demonstrations import (
     save_demonstrations,
 )
 from experiments import train
-from experiments.training import Plan
+from experiments.runs.execution import Plan
 
 
 @dataclasses.dataclass(frozen=True)

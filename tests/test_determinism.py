@@ -10,12 +10,12 @@ from typing import Any
 import jax
 import pytest
 
-from ccil_jax import runner
-from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import Config, unused
-from ccil_jax.digests import Identity
 from ccil_jax.methods import METHODS
-from ccil_jax.program import compile_program
+from ccil_jax.training import runner
+from ccil_jax.training.checkpointing import Checkpointer
+from ccil_jax.training.manifests import Identity
+from ccil_jax.training.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 IN_A_PROCESS = """

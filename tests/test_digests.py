@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import checkpointing, digests, files
-from ccil_jax.checkpointing import Checkpointer
 from ccil_jax.config import Config
-from ccil_jax.digests import CheckpointError, Identity
-from ccil_jax.files import LockedError
+from ccil_jax.training import checkpointing, filesystem, manifests
+from ccil_jax.training.checkpointing import Checkpointer
+from ccil_jax.training.filesystem import LockedError
+from ccil_jax.training.manifests import CheckpointError, Identity
 from tests.probe_envs import same_bits
 
 CONFIG = Config(method="lgail", cost_limit=1.0)
@@ -71,7 +71,7 @@ def test_what_is_saved_comes_back(folder: Path) -> None:
     with Checkpointer(folder, IDENTITY) as checkpoints:
         assert checkpoints.latest_step() == 3
         assert same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
-    manifest = json.loads((folder / "3" / digests.NAME).read_text())
+    manifest = json.loads((folder / "3" / manifests.NAME).read_text())
     assert manifest["arrays"]["params.kernel"]["shape"] == [2, 250]
     assert manifest["arrays"]["key"]["dtype"] == "key<fry>"
     assert [config["cost_limit"] for config in manifest["identity"]["configs"]] == [1.0, 2.0]
@@ -90,9 +90,9 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
         content[random.integers(len(content))] ^= 1 << random.integers(8)
         path.write_bytes(content)
         with pytest.raises(CheckpointError, match=path.name):
-            digests.read(folder / "3")
+            manifests.read(folder / "3")
         path.write_bytes(before)
-    digests.read(folder / "3")
+    manifests.read(folder / "3")
 
 
 def truncate(path: Path) -> None:
@@ -129,7 +129,7 @@ def test_an_unfinished_step_is_no_checkpoint(tmp_path: Path) -> None:
     """Killed between orbax's commit and the manifest, in the first save of all: the run starts over."""
     with Checkpointer(tmp_path, IDENTITY) as checkpoints:
         checkpoints.save(1, state(1))
-        (tmp_path / "1" / digests.NAME).unlink()
+        (tmp_path / "1" / manifests.NAME).unlink()
         assert checkpoints.latest_step() is None
         checkpoints.save(1, state(1))
         assert checkpoints.latest_step() == 1
@@ -137,7 +137,7 @@ def test_an_unfinished_step_is_no_checkpoint(tmp_path: Path) -> None:
 
 def test_nothing_intact_is_an_error(folder: Path) -> None:
     for step in ("2", "3"):
-        truncate(folder / step / digests.NAME)
+        truncate(folder / step / manifests.NAME)
     with Checkpointer(folder, IDENTITY) as checkpoints, pytest.raises(CheckpointError, match="no other is intact"):
         checkpoints.latest_step()
     assert (folder / "3").exists()
@@ -208,11 +208,11 @@ def test_a_field_that_may_move_is_not_compared(folder: Path) -> None:
 
 
 def test_a_checkpoint_of_before_there_were_identities_is_compared_by_its_configuration(folder: Path) -> None:
-    path = folder / "3" / digests.NAME
+    path = folder / "3" / manifests.NAME
     manifest = json.loads(path.read_text())
     del manifest["sha256"]
     manifest["config"] = manifest.pop("identity")["configs"][0]
-    path.write_text(json.dumps({**manifest, "sha256": digests._sha256(manifest)}))
+    path.write_text(json.dumps({**manifest, "sha256": manifests._sha256(manifest)}))
     with Checkpointer(folder, other(seed=7)) as checkpoints:
         checkpoints.restore(3, shapes(state(0)))
     identity = other(configs=(CONFIG.replace(gamma=0.5),))
@@ -235,15 +235,15 @@ def test_a_step_that_is_there_is_never_saved_over(folder: Path) -> None:
 
 def test_what_is_replaced_is_set_aside_whole(folder: Path) -> None:
     with Checkpointer(folder, IDENTITY) as checkpoints:
-        before = (folder / "3" / digests.NAME).read_bytes()
+        before = (folder / "3" / manifests.NAME).read_bytes()
         checkpoints.replace(3, state(3))  # the same arrays: nothing to do
-        assert (folder / "3" / digests.NAME).read_bytes() == before
+        assert (folder / "3" / manifests.NAME).read_bytes() == before
         checkpoints.replace(2, state(7))
         assert sorted(path.name for path in folder.iterdir()) == ["2", "2.replaced", "3.replaced"]
         assert checkpoints.latest_step() == 2
         assert same_bits(checkpoints.restore(2, shapes(state(0))), state(7))
-    assert (folder / "3.replaced" / digests.NAME).read_bytes() == before
-    digests.read(folder / "2.replaced")
+    assert (folder / "3.replaced" / manifests.NAME).read_bytes() == before
+    manifests.read(folder / "2.replaced")
     with Checkpointer(folder, IDENTITY) as checkpoints:
         checkpoints.replace(2, state(8))  # what was set aside before stays too
     assert sorted(path.name for path in folder.iterdir()) == ["2", "2.replaced", "2.replaced-2", "3.replaced"]
@@ -269,7 +269,7 @@ def test_a_full_disk_ends_the_run_now(folder: Path, monkeypatch: pytest.MonkeyPa
             raise OSError(errno.ENOSPC, "No space left on device")
 
         with monkeypatch.context() as patch:
-            patch.setattr(digests, "write", fail)
+            patch.setattr(manifests, "write", fail)
             with pytest.raises(CheckpointError, match=r"4: no space left"):
                 checkpoints.save(4, state(4))
         assert checkpoints.latest_step() == 3
@@ -280,13 +280,13 @@ def test_two_writers_are_refused_and_a_killed_one_is_not(tmp_path: Path) -> None
     code = (
         f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent.parent)!r})\n"
         "from ccil_jax import files\n"
-        f"with files.hold(pathlib.Path({str(path)!r})): print('held', flush=True); sys.stdin.read()"
+        f"with filesystem.hold(pathlib.Path({str(path)!r})): print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", code]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout and other.stdout.readline() == "held\n"
-        with pytest.raises(LockedError, match=f"in use by process {other.pid} on "), files.hold(path):
+        with pytest.raises(LockedError, match=f"in use by process {other.pid} on "), filesystem.hold(path):
             pass
         other.kill()
-    with files.hold(path), pytest.raises(LockedError), files.hold(path):
+    with filesystem.hold(path), pytest.raises(LockedError), filesystem.hold(path):
         pass

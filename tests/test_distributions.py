@@ -7,8 +7,8 @@ import pytest
 import scipy.integrate
 import scipy.stats
 
-from ccil_jax import distributions
-from ccil_jax.distributions import Gaussian
+from ccil_jax.acting import distributions
+from ccil_jax.acting.distributions import Gaussian
 
 MEAN, LOG_STD = np.array([[0.5, -1.0], [2.0, 0.0]]), np.array([0.3, -0.7])
 OTHER_MEAN, OTHER_LOG_STD = np.array([[0.1, -0.8], [1.5, 0.4]]), np.array([-0.2, 0.1])

@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import constraints, networks, on_policy, policy_step, regression, rollout, running_statistics
+from ccil_jax.acting import networks, rollout, running_statistics
+from ccil_jax.acting.rollout import Actor, RolloutState
+from ccil_jax.agents import on_policy
+from ccil_jax.agents.on_policy import AgentState, EpisodeEstimates
 from ccil_jax.config import Config
-from ccil_jax.on_policy import AgentState, EpisodeEstimates
-from ccil_jax.regression import Critic
-from ccil_jax.rollout import Actor, RolloutState
+from ccil_jax.learning import constraints, policy_step, regression
+from ccil_jax.learning.regression import Critic
 from ccil_jax.types import Batch, PyTree, Transition
 from tests.probe_envs import Counter, Probe, Walk, quick_compilation, walk_config
 

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax import evaluation, networks, running_statistics
-from ccil_jax.evaluation import Evaluation
-from ccil_jax.rollout import Actor
+from ccil_jax.acting import evaluation, networks, running_statistics
+from ccil_jax.acting.evaluation import Evaluation
+from ccil_jax.acting.rollout import Actor
 from tests.probe_envs import Walk, same_bits, walk_config
 
 CONFIG = walk_config(method="trpo")

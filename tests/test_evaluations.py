@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from experiments import evaluations
-from experiments.command_line import UsageError
+from experiments.cli.command_line import UsageError
+from experiments.runs import evaluations
 
 
 def evaluation(cost: float, **changes: Any) -> dict[str, Any]:

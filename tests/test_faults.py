@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax import runner
-from ccil_jax.runner import Progress
+from ccil_jax.training import runner
+from ccil_jax.training.runner import Progress
 from tests import faults
 from tests.faults import Suite
 from tests.probe_envs import Walk, quick_compilation, walk_config

@@ -13,8 +13,13 @@ import h5py
 import numpy as np
 import pytest
 
-from ccil_jax import hdf5, hdf5_child
-from ccil_jax.demonstrations import Demonstrations, DemonstrationsError, load_demonstrations, save_demonstrations
+from ccil_jax.demonstrations import hdf5, hdf5_child
+from ccil_jax.demonstrations.trajectories import (
+    Demonstrations,
+    DemonstrationsError,
+    load_demonstrations,
+    save_demonstrations,
+)
 from experiments import convert
 
 LENGTHS = (3, 4, 2)
@@ -348,16 +353,16 @@ def test_a_pickle_of_python_2(tmp_path: Path) -> None:
     new = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
     inner = new + b"(K\x01K\x02\x85" + dtype(b"f8", b"<") + b"\x89" + text(np.array([2.5, -1.0]).tobytes()) + b"tb"
     content = b"\x80\x02" + new + b"(K\x01K\x01\x85" + dtype(b"O8", b"|") + b"\x89](" + inner + b"etb."
-    from ccil_jax import legacy_npz
+    from ccil_jax.demonstrations import pickled_npz
 
-    np.testing.assert_array_equal(legacy_npz.unpickle(content, (1,), "x")[0][0], [2.5, -1.0])
+    np.testing.assert_array_equal(pickled_npz.unpickle(content, (1,), "x")[0][0], [2.5, -1.0])
 
 
 def test_all_pickles_of_a_file_share_one_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ccil_jax import legacy_npz
+    from ccil_jax.demonstrations import pickled_npz
 
     path = legacy(tmp_path / "expert.npz")
-    monkeypatch.setattr(legacy_npz, "MAX_OPCODES", 320)  # obs and acs take 153 each, rews 84
+    monkeypatch.setattr(pickled_npz, "MAX_OPCODES", 320)  # obs and acs take 153 each, rews 84
     with pytest.raises(DemonstrationsError, match="'rews' takes the file past 320 opcodes of pickles"):
         load_demonstrations(path)
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from flax import struct
 
-from ccil_jax import guard, on_policy, runner
-from ccil_jax.guard import GuardedState
-from ccil_jax.on_policy import Agent
-from envs.base import is_key
+from ccil_jax.agents import on_policy
+from ccil_jax.agents.on_policy import Agent
+from ccil_jax.training import guard, runner
+from ccil_jax.training.guard import GuardedState
+from envs.jax_tools import is_key
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 LIMIT = 3  # iterations in a row

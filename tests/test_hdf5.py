@@ -16,8 +16,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ccil_jax import hdf5, hdf5_child, npz
-from ccil_jax.npz import ArchiveError
+from ccil_jax.demonstrations import hdf5, hdf5_child, npz
+from ccil_jax.demonstrations.npz import ArchiveError
 
 
 @pytest.fixture

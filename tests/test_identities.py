@@ -12,9 +12,13 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax import methods, on_policy, reward_models, runner, running_statistics
+from ccil_jax import methods
+from ccil_jax.acting import running_statistics
+from ccil_jax.agents import on_policy
+from ccil_jax.agents.on_policy import AgentState
 from ccil_jax.config import Config
-from ccil_jax.on_policy import AgentState
+from ccil_jax.learning import reward_models
+from ccil_jax.training import runner
 from ccil_jax.types import ExpertData, Metrics
 from tests.probe_envs import (
     WALK_DEMONSTRATIONS_COST,

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from experiments.interruption import SIGNALS
+from experiments.cli.interruption import SIGNALS
 
 ROOT = Path(__file__).parent.parent
 BUSY = """
 import signal, sys
 sys.path.insert(0, {root!r})
-from experiments.interruption import SIGNALS, Interruption
+from experiments.cli.interruption import SIGNALS, Interruption
 for number in SIGNALS:  # whatever the tests were started with
     signal.signal(number, signal.SIG_DFL)
 with Interruption() as interruption:
@@ -102,6 +102,6 @@ def test_where_all_are_ignored_all_stay_so() -> None:
 def test_a_worker_ends_with_whoever_waits_even_where_sigterm_is_ignored() -> None:
     code = f"import signal, sys, time; sys.path.insert(0, {str(ROOT)!r}); "
     code += "signal.signal(signal.SIGTERM, signal.SIG_IGN); "
-    code += "from experiments.interruption import stop_at_eof; stop_at_eof(); time.sleep(20)"
+    code += "from experiments.cli.interruption import stop_at_eof; stop_at_eof(); time.sleep(20)"
     done = subprocess.run([sys.executable, "-c", code], input="", text=True, timeout=30, check=False)
     assert done.returncode == -signal.SIGTERM

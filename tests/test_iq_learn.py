@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import iq_learn, networks, runner
+from ccil_jax.acting import networks
+from ccil_jax.agents import iq_learn
+from ccil_jax.agents.iq_learn import Minibatch
 from ccil_jax.config import Config
-from ccil_jax.demonstrations import Demonstrations
-from ccil_jax.iq_learn import Minibatch
+from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.training import runner
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 

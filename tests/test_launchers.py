@@ -13,11 +13,13 @@ import pytest
 
 import ccil_jax
 from ccil_jax.config import PRESETS, Config
-from ccil_jax.demonstrations import load_demonstrations
-from ccil_jax.files import file_sha256
+from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.methods import METHODS
-from experiments import evaluate, expert, options, recording, run_folder, train
-from experiments.command_line import Parser, UsageError, command
+from ccil_jax.training.filesystem import file_sha256
+from experiments import evaluate, expert, train
+from experiments.cli import options
+from experiments.cli.command_line import Parser, UsageError, command
+from experiments.runs import recording, run_folder
 from tests.probe_envs import quick_compilation
 
 TINY = ["--preset", "tiny", "--max-episode-steps", "20", "--num-seeds", "2", "--eval-episodes", "3"]
@@ -221,9 +223,10 @@ def test_exported_policies_are_the_learnt_ones(
     import jax.numpy as jnp
 
     import envs
-    from ccil_jax import networks, runner
-    from ccil_jax.rollout import act
-    from experiments.original import policies
+    from ccil_jax.acting import networks
+    from ccil_jax.acting.rollout import act
+    from ccil_jax.training import runner
+    from experiments.policies.original_simulator import policies
 
     files = [str(tmp_path / name) for name in ("policy.npz", "policy.stablehlo")]
     assert evaluate.main([f"{pipeline}/malm", "--episodes", "2", "--export", *files]) == 0
@@ -263,9 +266,9 @@ def test_numpy_policy_is_the_learnt_policy() -> None:
     import jax
     import jax.numpy as jnp
 
-    from ccil_jax import networks, running_statistics
-    from ccil_jax.rollout import Actor, act
-    from experiments.original import NumpyPolicy
+    from ccil_jax.acting import networks, running_statistics
+    from ccil_jax.acting.rollout import Actor, act
+    from experiments.policies.original_simulator import NumpyPolicy
 
     random = np.random.default_rng(0)
     for activation in ("tanh", "relu", "swish"):
@@ -284,9 +287,9 @@ def test_the_numpy_policy_of_iq_learn_is_the_jax_policy() -> None:
     import jax.numpy as jnp
 
     import envs
-    from ccil_jax import networks
-    from ccil_jax.rollout import Actor, act
-    from experiments.original import NumpyPolicy
+    from ccil_jax.acting import networks
+    from ccil_jax.acting.rollout import Actor, act
+    from experiments.policies.original_simulator import NumpyPolicy
 
     env = envs.make("Hopper")
     config = Config(method="iq_learn", hidden_sizes=(16, 8), activation="relu")
@@ -307,15 +310,15 @@ def test_original_episodes_are_scored_as_ours(task: str) -> None:
     import jax
 
     import envs
-    from experiments import original
+    from experiments.policies import original_simulator
 
     env: Any = envs.make(task, physics="native", max_episode_steps=15)
-    simulator = original.make_simulator(env)
+    simulator = original_simulator.make_simulator(env)
     random = np.random.default_rng(3)
     actions = list(random.uniform(env.action_low, env.action_high, (15, env.action_dim)))
     rest = iter(actions)
     policy: Any = SimpleNamespace(sample=lambda obs, random: next(rest))
-    steps = original.run_episode(simulator, policy, random, seed=5, deterministic=False)
+    steps = original_simulator.run_episode(simulator, policy, random, seed=5, deterministic=False)
     simulator.reset(seed=5)
     state = env.reset_to(simulator.unwrapped.data.qpos, simulator.unwrapped.data.qvel)
     total = np.zeros(2)
@@ -325,7 +328,7 @@ def test_original_episodes_are_scored_as_ours(task: str) -> None:
         total += [state.reward, state.cost]
     assert bool(state.done)
     np.testing.assert_allclose(
-        original.score(env, steps, contact_cost=True), [*total, len(steps["control"])], atol=1e-3
+        original_simulator.score(env, steps, contact_cost=True), [*total, len(steps["control"])], atol=1e-3
     )
     simulator.close()
 
@@ -417,7 +420,7 @@ def test_a_resume_that_is_refused_leaves_the_run_as_it_was(
 def test_resume_refuses_other_demonstrations(
     pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from ccil_jax.demonstrations import save_demonstrations
+    from ccil_jax.demonstrations.trajectories import save_demonstrations
 
     save_demonstrations(tmp_path / "other.npz", load_demonstrations(pipeline / "expert.npz").take_episodes(2))
     with pytest.raises(SystemExit):

@@ -8,21 +8,15 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from ccil_jax import (
-    constraints,
-    networks,
-    on_policy,
-    policy_step,
-    reward_models,
-    runner,
-    running_statistics,
-    trust_region,
-)
+from ccil_jax.acting import networks, running_statistics
+from ccil_jax.agents import on_policy
 from ccil_jax.config import Config
-from ccil_jax.constraints import Multiplier, Outer
-from ccil_jax.policy_step import PolicyStep
-from ccil_jax.reward_models import RewardModel
-from ccil_jax.trust_region import Directions
+from ccil_jax.learning import constraints, policy_step, reward_models, trust_region
+from ccil_jax.learning.constraints import Multiplier, Outer
+from ccil_jax.learning.policy_step import PolicyStep
+from ccil_jax.learning.reward_models import RewardModel
+from ccil_jax.learning.trust_region import Directions
+from ccil_jax.training import runner
 from ccil_jax.types import Batch, PyTree
 from tests.probe_envs import (
     PolicyProblem,

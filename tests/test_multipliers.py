@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from ccil_jax import constraints, multipliers
 from ccil_jax.config import Config, ConfigError, validate
-from ccil_jax.multipliers import Gains, Pid
+from ccil_jax.learning import constraints, multipliers
+from ccil_jax.learning.multipliers import Gains, Pid
 
 NUM_PROBLEMS, MAX_KL = 400, 0.01
 

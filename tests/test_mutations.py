@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import constraints, reward_models
-from ccil_jax.constraints import Outer
+from ccil_jax.learning import constraints, reward_models
+from ccil_jax.learning.constraints import Outer
 from tests.mutations import MUTATIONS, ROOT, Mutation
 
 

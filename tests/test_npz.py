@@ -14,8 +14,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ccil_jax import npz
-from ccil_jax.demonstrations import DemonstrationsError, load_demonstrations
+from ccil_jax.demonstrations import npz
+from ccil_jax.demonstrations.trajectories import DemonstrationsError, load_demonstrations
 
 ARRAYS = {"x": np.arange(12.0).reshape(3, 4), "flags": np.array([True, False]), "text": np.array("{}")}
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numba.core import caching
 
-from envs.base import full_precision
+from envs.jax_tools import full_precision
 from envs.locomotion import load_model
 from envs.physics import foreign, make_physics, resolve
 from envs.physics.bits import float64_bits

@@ -8,10 +8,11 @@ from typing import NoReturn
 
 import pytest
 
-from experiments import command_line, convert, devices
-from experiments.command_line import UsageError
+from experiments import convert
+from experiments.cli import command_line, xla
+from experiments.cli.command_line import UsageError
 
-SHIPPED = Path(devices.__file__).parent / "demonstrations" / "Swimmer.npz"
+SHIPPED = Path(convert.__file__).parent / "demonstrations" / "Swimmer.npz"
 
 
 @pytest.fixture
@@ -35,14 +36,14 @@ def test_launchers_work_without_a_home_folder(tmp_path: Path, monkeypatch: pytes
     assert out.is_file()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "own"))
-    devices.keep_programs()
+    xla.keep_programs()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "own")
 
 
 @pytest.mark.usefixtures("homeless")
 def test_programs_are_kept_where_a_cache_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    devices.keep_programs()
+    xla.keep_programs()
     assert Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "ccil_jax" / "programs"
 
 

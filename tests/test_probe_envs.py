@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import networks, on_policy, runner, running_statistics
+from ccil_jax.acting import networks, running_statistics
+from ccil_jax.agents import on_policy
 from ccil_jax.config import Config
-from ccil_jax.runner import Result
+from ccil_jax.training import runner
+from ccil_jax.training.runner import Result
 from tests.probe_envs import Conflict, Sign, quick_compilation
 
 # Values --------------------------------------------------------------------------------------------------------------

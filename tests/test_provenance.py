@@ -9,11 +9,11 @@ from typing import Any, NoReturn
 import pytest
 
 import ccil_jax
-from ccil_jax.versions import versions
-from experiments import run_folder
+from ccil_jax.training.versions import versions
+from experiments.runs import run_folder
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
-HERE = Path(run_folder.__file__).parent.parent
+HERE = Path(run_folder.__file__).parents[2]
 
 
 def install(monkeypatch: pytest.MonkeyPatch, folder: Path, direct_url: dict[str, Any] | None) -> None:
@@ -43,7 +43,7 @@ def test_a_wheel_says_which_commit_it_was_built_from(tmp_path: Path, monkeypatch
     install(monkeypatch, HERE, {"url": "file:///wheel", "archive_info": {}})
     (tmp_path / "ccil_jax").mkdir()
     (tmp_path / "ccil_jax" / "COMMIT").write_text(f"{COMMIT}-dirty\n")
-    monkeypatch.setattr(run_folder, "__file__", str(tmp_path / "experiments" / "run_folder.py"))
+    monkeypatch.setattr(run_folder, "__file__", str(tmp_path / "experiments" / "runs" / "run_folder.py"))
     assert run_folder.git_commit() == f"{COMMIT}-dirty"
 
 

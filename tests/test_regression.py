@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import regression
-from ccil_jax.regression import Critic
+from ccil_jax.learning import regression
+from ccil_jax.learning.regression import Critic
 
 BETA = 0.9  # of Adam's first moment
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import replay
-from ccil_jax.replay import Replay
+from ccil_jax.agents import replay
+from ccil_jax.agents.replay import Replay
 from ccil_jax.types import Transition
 
 

@@ -16,10 +16,11 @@ import pytest
 from matplotlib.patches import Rectangle
 
 from ccil_jax.config import Config
-from experiments import benchmark, figures, labels, report, run_folder, summary, training
-from experiments.command_line import UsageError
-from experiments.progress import Display
-from experiments.summary import Reference, aggregate_scores, scores
+from experiments import benchmark, report
+from experiments.cli.command_line import UsageError
+from experiments.cli.progress import Display
+from experiments.runs import execution, figures, labels, run_folder, summary
+from experiments.runs.summary import Reference, aggregate_scores, scores
 
 ERRORS = {"expert_return_standard_error": 2.0, "expert_cost_standard_error": 1.5}
 
@@ -272,7 +273,7 @@ def test_cloning_is_drawn_against_passes_beside_runs_that_take_steps(tmp_path: P
 
 
 def test_the_episode_shown_is_said_to_be_of_the_best_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from experiments import animation
+    from experiments.page import animation
 
     folders = [make_run(tmp_path / "a/run", "malm"), make_run(tmp_path / "b/run", "malm", num_seeds=1)]
     content = run_folder.read_json(folders[0] / "summary.json")
@@ -335,9 +336,9 @@ def test_the_summary_is_the_last_file_of_a_run(
     with monkeypatch.context() as patched:
         patched.setattr(figures, "draw_run", no_space)
         with pytest.raises(OSError, match="No space left"):
-            training._finish(plan, result, None, 2, evaluated, random)
+            execution._finish(plan, result, None, 2, evaluated, random)
     assert not (folder / "summary.json").exists()
-    training._finish(plan, result, None, 2, evaluated, random)
+    execution._finish(plan, result, None, 2, evaluated, random)
     content = run_folder.read_json(folder / "summary.json")
     assert content["expert_cost_standard_error"] is content["violation_beyond_error"] is None
     assert (content["random_return_standard_error"], content["random_cost_standard_error"]) == (1.0, 1.0)
@@ -347,7 +348,7 @@ def test_the_summary_is_the_last_file_of_a_run(
 
 def test_poses_are_drawn_from_the_engine() -> None:
     import envs
-    from experiments.animation import record_poses, to_html
+    from experiments.page.animation import record_poses, to_html
 
     class Still:
         """A policy that does nothing."""
@@ -406,7 +407,7 @@ def test_benchmark_measures_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_safety_gym_episode_is_drawn_from_above() -> None:
     import envs
-    from experiments import top_down
+    from experiments.page import top_down
 
     class Ahead:
         """Full thrust."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax.returns import gae, successor_values
+from ccil_jax.learning.returns import gae, successor_values
 from tests.probe_envs import gae_by_loop
 
 

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax import networks, reward_models
+from ccil_jax.acting import networks
 from ccil_jax.config import CHOICES, Config
-from ccil_jax.reward_models import Discriminator, RewardModel
+from ccil_jax.learning import reward_models
+from ccil_jax.learning.reward_models import Discriminator, RewardModel
 from ccil_jax.types import ExpertData, Metrics, Transition
 from tests.probe_envs import same_bits
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import run_folder
-from experiments.command_line import UsageError
+from experiments.cli.command_line import UsageError
+from experiments.runs import run_folder
 
 
 def metrics(num_iterations: int, first: int = 0, **more: float) -> dict[str, np.ndarray]:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ccil_jax import running_statistics
+from ccil_jax.acting import running_statistics
 
 
 def batches() -> list[np.ndarray]:

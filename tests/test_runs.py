@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 import envs
-from ccil_jax import agents, runner
+from ccil_jax.agents import build
 from ccil_jax.config import Config, ConfigError
-from ccil_jax.history import EPISODE_ESTIMATES, without_unknown
-from ccil_jax.program import compile_program
-from ccil_jax.runner import Result
-from experiments import devices
+from ccil_jax.training import runner
+from ccil_jax.training.history import EPISODE_ESTIMATES, without_unknown
+from ccil_jax.training.program import compile_program
+from ccil_jax.training.runner import Result
+from experiments.cli import xla
 from tests.probe_envs import Counter, Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 NUM_SEEDS = 2
@@ -87,7 +88,7 @@ def test_stopped_and_resumed_together(results: list[Result], tmp_path: Path) -> 
     ("num_runs", "num_cores", "expected"), [(8, 4, 4), (3, 4, 3), (8, 1, 1), (8, 3, 4), (5, 4, 5), (7, 3, 1), (1, 4, 1)]
 )
 def test_devices_share_runs_evenly(num_runs: int, num_cores: int, expected: int) -> None:
-    assert devices.num_cpu_devices(num_runs, num_cores) == expected
+    assert xla.num_cpu_devices(num_runs, num_cores) == expected
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="Linux only")
@@ -126,7 +127,7 @@ def test_an_iteration_that_is_taken_back_ends_no_episode() -> None:
 def test_only_the_last_batch_of_an_iteration_is_kept() -> None:
     """No array of the program holds the steps of all generator steps, which at large sizes would be gigabytes."""
     config = runner.resolve(walk_config(method="malm", generator_steps=3), Walk(), walk_demonstrations())
-    agent = agents.make(config, Walk(), runner.expert_data(walk_demonstrations()))
+    agent = build.make(config, Walk(), runner.expert_data(walk_demonstrations()))
     state = jax.eval_shape(agent.init, jax.random.key(0))
     shapes = {value.aval.shape for value in values_of(jax.make_jaxpr(agent.step)(state).jaxpr)}
     batch = (config.num_steps, config.num_envs)
@@ -161,7 +162,7 @@ def test_fields_that_agree_stay_numbers() -> None:
 ON_FOUR_DEVICES = """
 import json, sys, jax
 from ccil_jax import evaluation, runner
-from ccil_jax.program import compile_program
+from ccil_jax.training.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 env, demonstrations = Walk(), walk_demonstrations()
@@ -232,34 +233,34 @@ def test_a_chunk_of_iterations_stays_on_its_device() -> None:
 def test_vectors_are_as_wide_as_the_processor_has_them_unless_the_user_says_otherwise(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(devices, "_processor_features", lambda: "flags : sse2 avx512f avx512_bf16")
+    monkeypatch.setattr(xla, "_processor_features", lambda: "flags : sse2 avx512f avx512_bf16")
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    devices.widen_vectors()
-    devices.widen_vectors()
+    xla.widen_vectors()
+    xla.widen_vectors()
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=512"
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
-    devices.widen_vectors()
+    xla.widen_vectors()
     assert os.environ["XLA_FLAGS"].split() == [
         "--xla_force_host_platform_device_count=2",
         "--xla_cpu_prefer_vector_width=512",
     ]
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=128")
-    devices.widen_vectors()
+    xla.widen_vectors()
     assert os.environ["XLA_FLAGS"] == "--xla_cpu_prefer_vector_width=128"
-    monkeypatch.setattr(devices, "_processor_features", lambda: "flags : sse2 avx512f")
+    monkeypatch.setattr(xla, "_processor_features", lambda: "flags : sse2 avx512f")
     monkeypatch.delenv("XLA_FLAGS")
-    devices.widen_vectors()
+    xla.widen_vectors()
     assert "XLA_FLAGS" not in os.environ
 
 
 def test_gpus_run_loops_as_graphs_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("XLA_FLAGS", raising=False)
-    devices.tune_gpus()
-    devices.tune_gpus()
+    xla.tune_gpus()
+    xla.tune_gpus()
     flags = ["--xla_gpu_enable_command_buffer=+WHILE", "--xla_gpu_enable_triton_gemm=false"]
     assert os.environ["XLA_FLAGS"].split() == flags
     monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_enable_command_buffer= --xla_cpu_prefer_vector_width=512")
-    devices.tune_gpus()
+    xla.tune_gpus()
     assert os.environ["XLA_FLAGS"].split() == [
         "--xla_gpu_enable_command_buffer=",
         "--xla_cpu_prefer_vector_width=512",
@@ -276,10 +277,10 @@ def test_compiled_programs_are_kept_unless_the_user_says_otherwise(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "mine")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_MAX_SIZE", "1")
-    devices.keep_programs()
+    xla.keep_programs()
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "mine"
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
-    devices.keep_programs()
+    xla.keep_programs()
     folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
     assert folder.is_dir()
     assert folder.parent == tmp_path / "ccil_jax" / "programs"
@@ -287,5 +288,5 @@ def test_compiled_programs_are_kept_unless_the_user_says_otherwise(
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
-    devices.keep_programs()
+    xla.keep_programs()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

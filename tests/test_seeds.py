@@ -9,9 +9,10 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax import on_policy, runner
-from ccil_jax.guard import GuardedState
-from ccil_jax.program import Program, compile_program
+from ccil_jax.agents import on_policy
+from ccil_jax.training import runner
+from ccil_jax.training.guard import GuardedState
+from ccil_jax.training.program import Program, compile_program
 from ccil_jax.types import Metrics
 from envs.base import State
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations

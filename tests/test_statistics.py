@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ccil_jax.demonstrations import Demonstrations
-from experiments import summary
-from experiments.statistics import Interval, bootstrap_interval, interquartile_mean, known_deviation, known_mean
-from experiments.summary import Reference, aggregate_scores, per_seed_scores, scores
+from ccil_jax.demonstrations.trajectories import Demonstrations
+from experiments.runs import summary
+from experiments.runs.intervals import Interval, bootstrap_interval, interquartile_mean, known_deviation, known_mean
+from experiments.runs.summary import Reference, aggregate_scores, per_seed_scores, scores
 
 REFERENCE = Reference(expert_return=110.0, expert_cost=40.0, random_return=10.0, random_cost=3.0, cost_limit=None)
 WITH_ERROR = dataclasses.replace(REFERENCE, expert_return_standard_error=6.5, expert_cost_standard_error=2.5)
@@ -18,7 +18,7 @@ WITH_ERROR = dataclasses.replace(REFERENCE, expert_return_standard_error=6.5, ex
 
 @dataclasses.dataclass
 class Episodes:
-    """Stands in for `ccil_jax.evaluation.Evaluation`."""
+    """Stands in for `ccil_jax.acting.evaluation.Evaluation`."""
 
     episode_return: np.ndarray
     episode_cost: np.ndarray

@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 import envs
-from ccil_jax import digests, runner
-from ccil_jax.demonstrations import Demonstrations, save_demonstrations
-from experiments import run_folder, sweep, sweep_worker, variants, workers
-from experiments.command_line import UsageError
+from ccil_jax.demonstrations.trajectories import Demonstrations, save_demonstrations
+from ccil_jax.training import manifests, runner
+from experiments import sweep
+from experiments.cli.command_line import UsageError
+from experiments.runs import run_folder
+from experiments.sweeps import backends, variants, worker
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config
 from tests.processes import command_lines, in_proc
 
@@ -175,7 +177,7 @@ class Killer(threading.Thread):
 
     @staticmethod
     def _workers(folder: Path) -> list[int]:
-        wanted = {"experiments.sweep_worker", str(folder)}
+        wanted = {"experiments.sweeps.worker", str(folder)}
         return [pid for pid, words in command_lines().items() if wanted <= set(words)]
 
 
@@ -229,7 +231,7 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
         assert again["episode_cost"] == row["episode_cost"]
     program = next(iter(out.glob("programs/*")))
     log = (program / "worker.log").read_text()
-    assert sweep_worker.main([str(program)]) == 0  # nothing is left to do
+    assert worker.main([str(program)]) == 0  # nothing is left to do
     assert (program / "worker.log").read_text() == log
     assert {path: path.stat().st_mtime_ns for path in others} == others
     assert sorted(path.name for path in (folder / "checkpoints").glob("[0-9]*")) == ["2"]
@@ -252,7 +254,7 @@ def checkpoints_agree_with_metrics(out: Path) -> None:
         run = run_folder.read_run(folder)
         env = envs.make("Swimmer", **run.facts["env_options"])
         assert jax.tree.leaves(runner.load(run.config, env, folder / "checkpoints", 2).agent)
-        saved = digests.read(folder / "checkpoints" / "2")["arrays"]
+        saved = manifests.read(folder / "checkpoints" / "2")["arrays"]
         metrics = run_folder.read_metrics(folder)
         assert {name for name in saved if name.startswith("history.")} == {f"history.{name}" for name in metrics}
         for name, rows in metrics.items():  # nine digits are enough for a float32 number
@@ -277,7 +279,7 @@ def test_a_run_that_another_program_left_is_set_aside_whole(tmp_path: Path) -> N
 def test_a_stopped_sweep_starts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stopping = threading.Event()
     stopping.set()
-    assert workers.run_worker(tmp_path, stopping=stopping) == "stopped before it began"
+    assert backends.run_worker(tmp_path, stopping=stopping) == "stopped before it began"
     assert list(tmp_path.iterdir()) == []
 
     begun = []
@@ -288,8 +290,8 @@ def test_a_stopped_sweep_starts_nothing(tmp_path: Path, monkeypatch: pytest.Monk
             assert stopping.wait(60)
         return None
 
-    monkeypatch.setattr(workers, "run_worker", work)
-    outcomes = workers.in_processes([Path(name) for name in "abc"], num_workers=1)
+    monkeypatch.setattr(backends, "run_worker", work)
+    outcomes = backends.in_processes([Path(name) for name in "abc"], num_workers=1)
     assert next(outcomes) == (Path("a"), None)
     while begun != ["a", "b"]:
         time.sleep(0.01)
@@ -299,26 +301,26 @@ def test_a_stopped_sweep_starts_nothing(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_workers_share_the_gpus_of_a_machine() -> None:
     fraction = "XLA_PYTHON_CLIENT_MEM_FRACTION"
-    assert workers.gpu_share(0, 4, [], {}) == {}
-    assert workers.gpu_share(0, 1, ["0", "1"], {}) == {}  # a worker alone has them all
-    assert [workers.gpu_share(i, 2, ["0", "7"], {}) for i in range(2)] == [
+    assert backends.gpu_share(0, 4, [], {}) == {}
+    assert backends.gpu_share(0, 1, ["0", "1"], {}) == {}  # a worker alone has them all
+    assert [backends.gpu_share(i, 2, ["0", "7"], {}) for i in range(2)] == [
         {"CUDA_VISIBLE_DEVICES": "0"},
         {"CUDA_VISIBLE_DEVICES": "7"},
     ]
-    assert [workers.gpu_share(i, 3, ["0", "1"], {}) for i in range(3)] == [
+    assert [backends.gpu_share(i, 3, ["0", "1"], {}) for i in range(3)] == [
         {"CUDA_VISIBLE_DEVICES": gpu, fraction: "0.400"} for gpu in ("0", "1", "0")
     ]
     own = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    assert workers.gpu_share(1, 3, ["0"], own) == {"CUDA_VISIBLE_DEVICES": "0"}
+    assert backends.gpu_share(1, 3, ["0"], own) == {"CUDA_VISIBLE_DEVICES": "0"}
 
 
 def test_gpus_are_those_that_the_user_lets_a_process_see(tmp_path: Path) -> None:
-    assert workers.visible_gpus({}, driver=tmp_path / "none") == []
+    assert backends.visible_gpus({}, driver=tmp_path / "none") == []
     for name in ("0000:01:00.0", "0000:02:00.0"):
         (tmp_path / name).mkdir()
-    assert workers.visible_gpus({}, driver=tmp_path) == ["0", "1"]
-    assert workers.visible_gpus({"CUDA_VISIBLE_DEVICES": "3,GPU-5"}, driver=tmp_path) == ["3", "GPU-5"]
-    assert workers.visible_gpus({"CUDA_VISIBLE_DEVICES": ""}, driver=tmp_path) == []
+    assert backends.visible_gpus({}, driver=tmp_path) == ["0", "1"]
+    assert backends.visible_gpus({"CUDA_VISIBLE_DEVICES": "3,GPU-5"}, driver=tmp_path) == ["3", "GPU-5"]
+    assert backends.visible_gpus({"CUDA_VISIBLE_DEVICES": ""}, driver=tmp_path) == []
 
 
 def test_settings_of_slurm_are_refused_where_slurm_is_not_used(
@@ -339,11 +341,11 @@ def broken_program(folder: Path) -> Path:
 
 def test_a_program_that_fails_is_reported(tmp_path: Path) -> None:
     folders = [broken_program(tmp_path / "programs" / name) for name in "ab"]
-    outcomes = dict(workers.in_processes(folders, num_workers=2))
+    outcomes = dict(backends.in_processes(folders, num_workers=2))
     assert set(outcomes) == set(folders)
     for folder, failure in outcomes.items():
         assert failure is not None
-        assert failure.startswith("exit status 2: python -m experiments.sweep_worker: error:")
+        assert failure.startswith("exit status 2: python -m experiments.sweeps.worker: error:")
         assert failure.endswith(f"damaged; repeat the sweep in another folder ({folder / 'worker.log'})")
 
 
@@ -363,7 +365,7 @@ def test_ray_places_programs_on_a_cluster_of_two_nodes(tmp_path: Path) -> None:
     folders = [small_program(tmp_path), broken_program(tmp_path / "programs" / "broken")]
     os.environ["RAY_ADDRESS"] = cluster.address
     try:
-        outcomes = dict(workers.on_ray(folders, num_workers=2))
+        outcomes = dict(backends.on_ray(folders, num_workers=2))
     finally:
         del os.environ["RAY_ADDRESS"]
         cluster.shutdown()
@@ -376,7 +378,7 @@ def test_submitit_carries_programs_out(tmp_path: Path) -> None:
     """Where there is no SLURM, submitit's executor starts the same jobs on this machine."""
     pytest.importorskip("submitit", reason="the extra slurm is not installed")
     folders = [small_program(tmp_path), broken_program(tmp_path / "programs" / "broken")]
-    outcomes = dict(workers.on_slurm(folders, 2, tmp_path / "slurm", {"timeout_min": 10}))
+    outcomes = dict(backends.on_slurm(folders, 2, tmp_path / "slurm", {"timeout_min": 10}))
     assert outcomes[folders[0]] is None
     assert "exit status 2" in str(outcomes[folders[1]])
     assert (tmp_path / "runs" / "expert" / "summary.json").exists()
@@ -392,11 +394,11 @@ def die_once(folder: Path) -> None:
 
 def test_a_lost_slurm_job_is_replaced_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("submitit", reason="the extra slurm is not installed")
-    monkeypatch.setattr(workers, "run_worker", die_once)
+    monkeypatch.setattr(backends, "run_worker", die_once)
     folders = [tmp_path / name for name in ("once", "always")]
     for folder in folders:
         folder.mkdir()
-    outcomes = dict(workers.on_slurm(folders, 2, tmp_path / "slurm", {"timeout_min": 10}))
+    outcomes = dict(backends.on_slurm(folders, 2, tmp_path / "slurm", {"timeout_min": 10}))
     assert outcomes[folders[0]] is None
     assert str(outcomes[folders[1]]).startswith("lost by SLURM: job ")
     assert str(tmp_path / "slurm") in str(outcomes[folders[1]])
@@ -404,7 +406,7 @@ def test_a_lost_slurm_job_is_replaced_once(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize(("launcher", "package"), [("ray", "ray"), ("slurm", "submitit")])
 def test_a_missing_extra_is_named(launcher: str, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(workers.UsageError, match=rf"{package} is not installed; pip install 'ccil_jax\[{launcher}\]'"):
-        workers.check_launcher(launcher)
-    workers.check_launcher("processes")
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(backends.UsageError, match=rf"{package} is not installed; pip install 'ccil_jax\[{launcher}\]'"):
+        backends.check_launcher(launcher)
+    backends.check_launcher("processes")

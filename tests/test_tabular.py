@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from ccil_jax import tabular
-from ccil_jax.tabular import Array, Process
+from experiments.theory import tabular
+from experiments.theory.tabular import Array, Process
 
 BETA = 0.1
 

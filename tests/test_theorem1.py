@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ccil_jax import tabular
-from experiments import theorem1, theorem1_checks
-from experiments.theorem1_checks import Problem
+from experiments import theorem1
+from experiments.theory import tabular, theorem1_checks
+from experiments.theory.theorem1_checks import Problem
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from ccil_jax import constraints, distributions, policy_step, trust_region
-from ccil_jax.trust_region import Directions
+from ccil_jax.acting import distributions
+from ccil_jax.learning import constraints, policy_step, trust_region
+from ccil_jax.learning.trust_region import Directions
 from ccil_jax.types import Metrics, PyTree
 from tests.probe_envs import PolicyProblem, numpy_log_prob, numpy_policy, policy_problem, same_bits
 

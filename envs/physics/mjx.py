@@ -15,7 +15,7 @@ import mujoco
 from flax import struct
 from jax.typing import ArrayLike
 
-from envs.base import full_precision, usual_rules
+from envs.jax_tools import full_precision, usual_rules
 from envs.physics.base import Data, Mocap
 from envs.physics.mjx_patch import align_plane_capsule_frames, searches_that_end
 

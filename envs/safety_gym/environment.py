@@ -10,7 +10,8 @@ from jax.scipy.spatial.transform import Rotation
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
-from envs.base import State, check_shape, compute_where, executed, first_state, next_state
+from envs.base import State, check_shape, executed, first_state, next_state
+from envs.jax_tools import compute_where
 from envs.physics import Mocap
 from envs.safety_gym import layout as layouts
 from envs.safety_gym import scene as scenes

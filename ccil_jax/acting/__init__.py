@@ -1,0 +1,1 @@
+"""From observations to actions and episodes: networks, distributions, rollouts and evaluation."""

@@ -1,0 +1,125 @@
+"""The networks: policies, critics and discriminator. The rest of the package sees only init and apply."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ccil_jax.acting.distributions import Gaussian, TanhGaussian
+from ccil_jax.config import Config
+from ccil_jax.types import PyTree
+from envs.base import Environment
+
+ACTIVATIONS = {"tanh": nn.tanh, "relu": nn.relu, "swish": nn.swish}
+
+
+class MLP(nn.Module):
+    """Fully connected network; `final_scale` shrinks the initial last layer.
+
+    Initial weights are Glorot and Bengio's (2010), for tanh. Not orthogonal ones: their batched QR kernel on the CPU
+    waits for helpers from the very threads it occupies, and hung with 5 seeds on 2 and on 3 threads (jaxlib 0.10).
+    """
+
+    sizes: Sequence[int]
+    activation: Callable[[jax.Array], jax.Array]
+    final_scale: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for size in self.sizes[:-1]:
+            x = self.activation(nn.Dense(size, kernel_init=_glorot(1.0))(x))
+        return nn.Dense(self.sizes[-1], kernel_init=_glorot(self.final_scale))(x)
+
+
+def _glorot(scale: float) -> jax.nn.initializers.Initializer:
+    return nn.initializers.variance_scaling(scale**2, "fan_avg", "uniform")
+
+
+class Network(NamedTuple):
+    """A pair of pure functions."""
+
+    init: Callable[[jax.Array], PyTree]
+    apply: Callable[..., jax.Array]
+
+
+class Policy(NamedTuple):
+    """`init(key) -> params`; `apply(params, normalized_obs) -> Gaussian`."""
+
+    init: Callable[[jax.Array], PyTree]
+    apply: Callable[[PyTree, jax.Array], Gaussian]
+
+
+class SquashedPolicy(NamedTuple):
+    """`init(key) -> params`; `apply(params, obs) -> TanhGaussian`."""
+
+    init: Callable[[jax.Array], PyTree]
+    apply: Callable[[PyTree, jax.Array], TanhGaussian]
+
+
+def _mlp(config: Config, out: int, final_scale: float) -> MLP:
+    return MLP((*config.hidden_sizes, out), ACTIVATIONS[config.activation], final_scale)
+
+
+def make_policy(config: Config, obs_dim: int, action_dim: int, initial_std: jax.typing.ArrayLike = 1.0) -> Policy:
+    """Gaussian policy: mean from an MLP whose last layer starts small, log-std a free vector (authors).
+
+    `initial_std` is [action_dim] or one for all.
+    """
+    mlp = _mlp(config, action_dim, final_scale=0.01)
+
+    def init(key: jax.Array) -> PyTree:
+        log_std = jnp.broadcast_to(jnp.log(jnp.asarray(initial_std, jnp.result_type(float))), action_dim)
+        return {"mean": mlp.init(key, jnp.zeros((1, obs_dim))), "log_std": log_std}
+
+    def apply(params: PyTree, obs: Float[Array, "... D"]) -> Gaussian:
+        mean: jax.Array = mlp.apply(params["mean"], obs)  # type: ignore[assignment]  # flax: Any or a tuple
+        return Gaussian(mean=mean, log_std=params["log_std"])
+
+    return Policy(init, apply)
+
+
+LOG_STD_RANGE = (-5.0, 2.0)  # of a squashed policy (the published code of IQ-Learn, after pytorch_sac)
+
+
+def make_squashed_policy(config: Config, env: Environment) -> SquashedPolicy:
+    """Tanh-Gaussian policy within the environment's action range; mean and deviation from one MLP."""
+    mlp = _mlp(config, 2 * env.action_dim, final_scale=1.0)
+    low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
+    smallest, largest = LOG_STD_RANGE
+
+    def init(key: jax.Array) -> PyTree:
+        return {"squashed": mlp.init(key, jnp.zeros((1, env.obs_dim)))}
+
+    def apply(params: PyTree, obs: Float[Array, "... D"]) -> TanhGaussian:
+        output: jax.Array = mlp.apply(params["squashed"], obs)  # type: ignore[assignment]  # flax: Any or a tuple
+        mean, spread = jnp.split(output, 2, axis=-1)
+        log_std = smallest + (largest - smallest) * (jnp.tanh(spread) + 1) / 2
+        return TanhGaussian(
+            gaussian=Gaussian(mean=mean, log_std=log_std), center=(low + high) / 2, half_range=(high - low) / 2
+        )
+
+    return SquashedPolicy(init, apply)
+
+
+def policy_of(config: Config, env: Environment) -> Policy | SquashedPolicy:
+    """The policy network of `config.method`, for acting with parameters that were learnt."""
+    if config.method == "iq_learn":
+        return make_squashed_policy(config, env)
+    return make_policy(config, env.obs_dim, env.action_dim)
+
+
+def make_scalar(config: Config, input_dim: int, final_scale: float = 1.0) -> Network:
+    """A critic or discriminator: [..., input_dim] -> [...]."""
+    mlp = _mlp(config, 1, final_scale)
+
+    def init(key: jax.Array) -> PyTree:
+        return mlp.init(key, jnp.zeros((1, input_dim)))
+
+    def apply(params: PyTree, x: Float[Array, "... D"]) -> Float[Array, "..."]:
+        values: jax.Array = mlp.apply(params, x)  # type: ignore[assignment]  # flax: Any or a tuple with collections
+        return values[..., 0]
+
+    return Network(init, apply)

@@ -1,0 +1,89 @@
+"""Behaviour cloning: the most likely policy given the demonstrations' actions, with held-out early stopping."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from ccil_jax.acting import distributions, networks, running_statistics
+from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.acting.rollout import Actor
+from ccil_jax.agents.on_policy import Agent, initial_std
+from ccil_jax.config import Config
+from ccil_jax.learning.minibatches import minibatches
+from ccil_jax.learning.optimizers import adam
+from ccil_jax.types import ExpertData, Metrics, PyTree
+from envs.base import Environment
+
+SMALLEST_LOG_STD = -4.0  # the likelihood of an action that the expert never varies has no maximum
+
+
+@struct.dataclass(kw_only=True)
+class AgentState:
+    """Everything one seed needs to continue exactly."""
+
+    actor: Actor  # the parameters that were best on the held-out steps so far
+    held_out_loss: jax.Array  # [] theirs
+    params: PyTree  # still training
+    optimizer: PyTree
+    key: jax.Array
+
+
+def negative_log_likelihood(
+    apply: Callable[[PyTree, jax.Array], Gaussian], params: PyTree, obs: jax.Array, action: jax.Array
+) -> jax.Array:
+    """Mean over the samples [M], nats."""
+    return -jnp.mean(distributions.log_prob(apply(params, obs), action))
+
+
+def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
+    """Builds the agent; an iteration is one pass over the demonstrations."""
+    assert expert is not None, "bc learns from demonstrations"
+    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
+    optimizer = adam(config.actor_learning_rate)
+    statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
+    obs = running_statistics.normalize(statistics, expert.obs)
+    held_out_obs = running_statistics.normalize(statistics, expert.held_out_obs)
+    minibatch_size = min(config.critic_minibatch_size, obs.shape[0])
+
+    def init(key: jax.Array) -> AgentState:
+        key, policy_key = jax.random.split(key)
+        params = policy.init(policy_key)
+        return AgentState(
+            # Buffers of its own: those of the parameters still training are donated too.
+            actor=Actor(policy_params=jax.tree.map(jnp.copy, params), obs_statistics=statistics),
+            held_out_loss=jnp.asarray(jnp.inf),
+            params=params,
+            optimizer=optimizer.init(params),
+            key=key,
+        )
+
+    def descend(learner: tuple[PyTree, PyTree], indices: jax.Array) -> tuple[tuple[PyTree, PyTree], jax.Array]:
+        params, optimizer_state = learner
+        loss, gradient = jax.value_and_grad(negative_log_likelihood, argnums=1)(
+            policy.apply, params, obs[indices], expert.action[indices]
+        )
+        change, optimizer_state = optimizer.update(gradient, optimizer_state)
+        params = optax.apply_updates(params, change)
+        return ({**params, "log_std": jnp.maximum(params["log_std"], SMALLEST_LOG_STD)}, optimizer_state), loss
+
+    def step(state: AgentState) -> tuple[AgentState, Metrics]:
+        key, shuffle_key = jax.random.split(state.key)
+        order = minibatches(shuffle_key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=1)
+        (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), order)
+        held_out = negative_log_likelihood(policy.apply, params, held_out_obs, expert.held_out_action)
+        better = held_out < state.held_out_loss
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), params, state.actor.policy_params)
+        new = AgentState(
+            actor=Actor(policy_params=best, obs_statistics=statistics),
+            held_out_loss=jnp.minimum(held_out, state.held_out_loss),
+            params=params,
+            optimizer=optimizer_state,
+            key=key,
+        )
+        entropy = distributions.entropy(Gaussian(mean=jnp.zeros(()), log_std=best["log_std"]))
+        return new, {"loss": jnp.mean(losses), "held_out_loss": held_out, "entropy": entropy}
+
+    return Agent(init, step)

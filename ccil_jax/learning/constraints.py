@@ -1,0 +1,279 @@
+"""How the cost enters the policy step: the part in which the methods differ.
+
+The policy step moves along `weights @ [x_r, x_c]`, the natural directions of the reward and the cost surrogate. A
+constraint chooses the weights (`combine`) and learns from the episode cost (`update`). `cost_gap` is J_k - J_E: the
+mean cost of finished episodes less the limit; `step_gap` is the same per step, the unit of the surrogates.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from ccil_jax.config import Config
+from ccil_jax.learning.multipliers import Gains, optimal_weights, pid_init, pid_step
+from ccil_jax.learning.optimizers import adam
+from ccil_jax.types import Metrics, PyTree
+
+# Adam moves xi by about its learning rate an update, so after a long time within the limit a vanishing softplus(xi)
+# would need as long again to become felt: it stays at least this large.
+SMALLEST_SOFTPLUS_MULTIPLIER = 1e-3
+
+
+@struct.dataclass(kw_only=True)
+class Multiplier:
+    """The Lagrange multiplier; `parameter` is xi with lambda = softplus(xi), or lambda itself."""
+
+    parameter: jax.Array  # []
+    optimizer: PyTree  # of the dual step
+    outer_optimizer: PyTree  # of the outer step
+
+
+@struct.dataclass(kw_only=True)
+class Outer:
+    """The outer (validation) loss of MALM on V held-out samples."""
+
+    reward_advantage: jax.Array  # [V]
+    cost: jax.Array  # [V]
+    importance_weights: Callable[[jax.Array], jax.Array] = struct.field(
+        pytree_node=False
+    )  # lambda -> pi_theta'(lambda)(a|s) / pi_theta_k(a|s), [V]
+
+
+@struct.dataclass(kw_only=True)
+class Episodes:
+    """What is known of the episode that each step of a batch belongs to, [T, N]."""
+
+    cost: jax.Array  # total if it finished within the batch, else extrapolated to a full-length episode
+    limit: jax.Array  # [] J_E
+
+
+class Constraint(NamedTuple):
+    """Pure functions. `entropy_in_cost`: steps may follow the cost alone, which must then carry the entropy bonus."""
+
+    init: Callable[[], PyTree]
+    multiplier: Callable[[PyTree], jax.Array]  # state -> lambda >= 0
+    gate: Callable[[jax.Array, jax.Array, Episodes], jax.Array]  # A_r, A_c, episodes -> A_r, all [T, N]
+    combine: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # lambda, step_gap, gram [2, 2] -> weights [2]
+    update: Callable[[PyTree, jax.Array, Outer | None], tuple[PyTree, Metrics]]  # state, cost_gap, outer
+    entropy_in_cost: bool = False
+
+
+def _no_gate(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
+    return reward_advantage
+
+
+def unconstrained(config: Config) -> Constraint:
+    """The cost does not enter (GAIL, TRPO)."""
+    return Constraint(
+        init=lambda: (),
+        multiplier=lambda state: jnp.zeros(()),
+        gate=_no_gate,
+        combine=lambda multiplier, step_gap, gram: jnp.array([1.0, 0.0]),
+        update=lambda state, cost_gap, outer: (state, {}),
+    )
+
+
+def lagrangian(config: Config) -> Constraint:
+    """Reward less lambda times cost, lambda by `config.multiplier_update`; dual ascent is Algorithm 1 line 14."""
+    if config.multiplier_update == "pid":
+        return pid(config)
+    if config.multiplier_update == "optimal":
+        return trust_region_optimal(config)
+    multiplier = ascent(config)
+    return Constraint(
+        init=multiplier.init,
+        multiplier=multiplier.read,
+        gate=_no_gate,
+        combine=_less_cost,
+        update=lambda state, cost_gap, outer: (multiplier.dual(state, cost_gap), {}),
+    )
+
+
+def _less_cost(multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array) -> jax.Array:
+    return jnp.stack([jnp.ones_like(multiplier), -multiplier])
+
+
+def pid(config: Config) -> Constraint:
+    """Reward less lambda times cost, lambda from a PID controller of the cost gap relative to the limit."""
+    gains = Gains(
+        proportional=config.pid_proportional_gain,
+        integral=config.pid_integral_gain,
+        derivative=config.pid_derivative_gain,
+        smoothing=config.pid_smoothing,
+    )
+    scale = jnp.maximum(jnp.asarray(config.cost_limit, jnp.result_type(float)), 1.0)
+    return Constraint(
+        init=lambda: pid_init(config.initial_multiplier),
+        multiplier=lambda state: state.multiplier,
+        gate=_no_gate,
+        combine=_less_cost,
+        update=lambda state, cost_gap, outer: (pid_step(state, cost_gap / scale, gains, config.multiplier_max), {}),
+    )
+
+
+def trust_region_optimal(config: Config) -> Constraint:
+    """The multiplier that is optimal for this one step, in closed form (constrained policy optimisation): no memory."""
+    return Constraint(
+        init=lambda: (),
+        multiplier=lambda state: jnp.zeros(()),
+        gate=_no_gate,
+        combine=lambda multiplier, step_gap, gram: optimal_weights(gram, step_gap, config.max_kl),
+        update=lambda state, cost_gap, outer: (state, {}),
+    )
+
+
+def meta_lagrangian(config: Config) -> Constraint:
+    """`lagrangian`, then a gradient step of the outer loss (Algorithm 1 lines 15 and 16)."""
+    inner = lagrangian(config)
+    if config.meta_gradient == "none":
+        return inner
+    multiplier = ascent(config)
+
+    def update(state: Multiplier, cost_gap: jax.Array, outer: Outer | None) -> tuple[Multiplier, Metrics]:
+        assert outer is not None, "the meta-gradient needs held-out samples"
+        after_dual = multiplier.dual(state, cost_gap)
+        gradient = outer_gradient(config.meta_gradient, multiplier.read(state), multiplier.read(after_dual), outer)
+        gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
+        return multiplier.outer(after_dual, gradient), {"meta_gradient": gradient}
+
+    return inner._replace(update=update)
+
+
+def outer_loss(
+    importance_weights: Float[Array, " V"],
+    reward_advantage: Float[Array, " V"],
+    cost: Float[Array, " V"],
+    multiplier: Float[Array, ""],
+) -> Float[Array, ""]:
+    """L = mean (w A_r - lambda' d)^2 on held-out samples (Algorithm 1 line 16)."""
+    return jnp.mean((importance_weights * reward_advantage - multiplier * cost) ** 2)
+
+
+def outer_gradient(
+    kind: str, multiplier: Float[Array, ""], after_dual: Float[Array, ""], outer: Outer
+) -> Float[Array, ""]:
+    """dL/dlambda' by forward mode through the inner policy step theta'(lambda), with d lambda / d lambda' = 1.
+
+    Args:
+        kind: "direct" holds theta' fixed with w = 1 (line 16 as printed); "indirect" is only the path through theta';
+            "full" is the total derivative.
+        multiplier: lambda, which shaped the inner step.
+        after_dual: lambda'.
+        outer: the held-out samples.
+    """
+    if kind == "direct":
+        ones = jnp.ones_like(outer.cost)
+        return jax.grad(outer_loss, argnums=3)(ones, outer.reward_advantage, outer.cost, after_dual)
+
+    def loss(multiplier: jax.Array, after_dual: jax.Array) -> jax.Array:
+        return outer_loss(outer.importance_weights(multiplier), outer.reward_advantage, outer.cost, after_dual)
+
+    one = jnp.ones_like(after_dual)
+    tangent = one if kind == "full" else jnp.zeros_like(after_dual)
+    return jax.jvp(loss, (multiplier, after_dual), (one, tangent))[1]
+
+
+def alternating(config: Config) -> Constraint:
+    """Ascend the reward while the cost is within the limit, else descend the cost (Algorithm 2 lines 8 to 11)."""
+
+    def by_batch(multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array) -> jax.Array:
+        return jnp.where(step_gap <= 0, jnp.array([1.0, 0.0]), jnp.array([0.0, -1.0]))
+
+    def by_episode(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
+        mixed = jnp.where(episodes.cost <= episodes.limit, reward_advantage, -cost_advantage)
+        return (mixed - jnp.mean(mixed)) / (jnp.std(mixed) + 1e-8)
+
+    plain = unconstrained(config)
+    if config.gate == "episode":
+        return plain._replace(gate=by_episode)
+    return plain._replace(combine=by_batch, entropy_in_cost=True)
+
+
+def inverse_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
+    """xi with softplus(xi) = value, for value >= SMALLEST_SOFTPLUS_MULTIPLIER (smaller values are raised to it)."""
+    value = jnp.maximum(value, SMALLEST_SOFTPLUS_MULTIPLIER)
+    return value + jnp.log(-jnp.expm1(-value))
+
+
+CONSTRAINTS: Mapping[str, Callable[[Config], Constraint]] = {  # by the names in `methods.METHODS`
+    "unconstrained": unconstrained,
+    "lagrangian": lagrangian,
+    "meta_lagrangian": meta_lagrangian,
+    "alternating": alternating,
+    "trust_region_optimal": trust_region_optimal,
+    "pid": pid,
+}
+
+
+def make(config: Config) -> Constraint:
+    """The constraint of `config.method`, an on-policy one."""
+    assert config.row.constraint is not None, f"{config.method} has no policy step to constrain"
+    return CONSTRAINTS[config.row.constraint](config)
+
+
+class Ascent(NamedTuple):
+    """A parametrisation of the multiplier and its two steps."""
+
+    init: Callable[[], Multiplier]
+    read: Callable[[Multiplier], jax.Array]  # lambda, in [0, multiplier_max]
+    dual: Callable[[Multiplier, jax.Array], Multiplier]  # along the cost gap (Algorithm 1 line 14)
+    outer: Callable[[Multiplier, jax.Array], Multiplier]  # against dL/dlambda' (Algorithm 1 line 16)
+
+
+def ascent(config: Config) -> Ascent:
+    """The parametrisation `config.multiplier_update` and the outer step `config.meta_update`."""
+    parametrize = {"adam": softplus_parameter, "sgd": projected_parameter}[config.multiplier_update]
+    read, write = parametrize(config.multiplier_max)
+    optimizer, outer_optimizer = adam(config.multiplier_learning_rate), adam(config.meta_learning_rate)
+
+    def init() -> Multiplier:
+        parameter = write(jnp.asarray(config.initial_multiplier, jnp.result_type(float)))
+        return Multiplier(
+            parameter=parameter,
+            optimizer=optimizer.init(parameter),
+            outer_optimizer=outer_optimizer.init(parameter),
+        )
+
+    def moved(state: Multiplier, parameter: jax.Array, **optimizers: PyTree) -> Multiplier:
+        # Beyond either end it would only wind up, and take as many updates to come back.
+        parameter = jnp.clip(parameter, write(jnp.zeros(())), write(jnp.asarray(config.multiplier_max)))
+        return dataclasses.replace(state, parameter=parameter, **optimizers)
+
+    def dual(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
+        if config.multiplier_update == "sgd":
+            return moved(state, write(read(state) + config.multiplier_learning_rate * cost_gap))
+        updates, optimizer_state = optimizer.update(-cost_gap, state.optimizer)
+        return moved(state, state.parameter + jnp.asarray(updates), optimizer=optimizer_state)
+
+    def outer(state: Multiplier, gradient: jax.Array) -> Multiplier:
+        if config.meta_update == "sgd":
+            return moved(state, write(read(state) - config.meta_learning_rate * gradient))
+        slope = jax.grad(lambda parameter: read(dataclasses.replace(state, parameter=parameter)))(state.parameter)
+        updates, optimizer_state = outer_optimizer.update(gradient * slope, state.outer_optimizer)
+        return moved(state, state.parameter + jnp.asarray(updates), outer_optimizer=optimizer_state)
+
+    return Ascent(init, read, dual, outer)
+
+
+Parameter = tuple[Callable[[Multiplier], jax.Array], Callable[[jax.Array], jax.Array]]  # read, write
+
+
+def softplus_parameter(maximum: jax.Array | float) -> Parameter:
+    """lambda = softplus(parameter), capped at `maximum`."""
+    return (
+        lambda state: jnp.minimum(jax.nn.softplus(state.parameter), maximum),
+        lambda multiplier: inverse_softplus(jnp.minimum(multiplier, maximum)),
+    )
+
+
+def projected_parameter(maximum: jax.Array | float) -> Parameter:
+    """lambda = parameter, projected to [0, maximum] when written."""
+    return (
+        lambda state: jnp.clip(state.parameter, 0.0, maximum),
+        lambda multiplier: jnp.clip(multiplier, 0.0, maximum),
+    )

@@ -1,0 +1,117 @@
+"""The policy step of one batch, and the same step as a function of the multiplier.
+
+Joins `trust_region`, which knows gradients, to `constraints`, which know multipliers.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax.flatten_util import ravel_pytree
+
+from ccil_jax.acting import distributions
+from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.config import Config
+from ccil_jax.learning import trust_region
+from ccil_jax.learning.constraints import Constraint, Outer
+from ccil_jax.learning.minibatches import permutation
+from ccil_jax.learning.trust_region import Directions
+from ccil_jax.types import Batch, Metrics, PyTree
+
+
+@struct.dataclass(kw_only=True)
+class PolicyStep:
+    """A policy step as a function of the multiplier: enough to replay and to differentiate it."""
+
+    policy_params: PyTree  # theta_k
+    directions: Directions
+    fraction: jax.Array  # [] of the line search; 0 if it was rejected, and then the replay stands still
+    step_gap: jax.Array  # [] J_k - J_E per step, when it was taken
+    held_out: Batch  # [V]
+
+
+def random_order(config: Config, key: jax.Array) -> jax.Array:
+    """Indices [K] of a batch's samples, the V held out first. Samples are numbered simulation by simulation fastest."""
+    if config.held_out_unit == "transition":
+        return permutation(key, config.batch_size)
+    simulations = permutation(key, config.num_envs)  # a simulation's whole stretch of the batch stays together
+    steps = jnp.arange(config.num_steps) * config.num_envs
+    return (simulations[:, None] + steps[None]).reshape(-1)
+
+
+def split(samples: Batch, num_held_out: int, order: jax.Array) -> tuple[Batch, Batch]:
+    """A partition into [V] held-out and [M] training samples (Algorithm 1 line 8); untouched if V is 0."""
+    if num_held_out:
+        samples = jax.tree.map(lambda x: x[order], samples)
+    return jax.tree.map(lambda x: x[:num_held_out], samples), jax.tree.map(lambda x: x[num_held_out:], samples)
+
+
+def importance(log_prob: jax.Array, old_log_prob: jax.Array) -> jax.Array:
+    """Probability ratios; log-ratios are clipped to +-20, far outside any trust region, so that none overflows."""
+    return jnp.exp(jnp.clip(log_prob - old_log_prob, -20.0, 20.0))
+
+
+def improve(
+    config: Config,
+    policy_apply: Callable[[PyTree, jax.Array], Gaussian],
+    constraint: Constraint,
+    policy_params: PyTree,
+    batch: Batch,
+    multiplier: jax.Array,
+    step_gap: jax.Array,
+    held_out: Batch,
+) -> tuple[PyTree, PolicyStep, Metrics]:
+    """The policy step on the training samples (Algorithm 1 line 10, Algorithm 2 lines 8 to 11)."""
+    params, unravel = ravel_pytree(policy_params)
+    old = policy_apply(policy_params, batch.obs)
+    old_log_prob = distributions.log_prob(old, batch.action)
+
+    def objectives(params: jax.Array) -> tuple[jax.Array, jax.Array]:
+        new = policy_apply(unravel(params), batch.obs)
+        weights = importance(distributions.log_prob(new, batch.action), old_log_prob)
+        bonus = config.policy_entropy_coefficient * distributions.entropy(new)
+        reward = jnp.mean(weights * batch.reward_advantage) + bonus
+        cost = jnp.mean(weights * batch.cost_advantage) - bonus * float(constraint.entropy_in_cost)
+        return jnp.stack([reward, cost]), jnp.mean(distributions.kl_divergence(old, new))
+
+    gradients = jax.jacrev(lambda params: objectives(params)[0])(params)
+    fisher_obs = batch.obs[:: config.fisher_stride]
+    product = trust_region.fisher_vector_product(
+        lambda params: policy_apply(unravel(params), fisher_obs), params, config.cg_damping
+    )
+    directions = trust_region.directions(product, gradients, config.cg_iterations)
+    weights = constraint.combine(multiplier, step_gap, directions.gram)
+    new_params, fraction, metrics = trust_region.step(
+        params,
+        directions,
+        weights,
+        objectives,
+        max_kl=config.max_kl,
+        kl_tolerance=config.kl_tolerance,
+        num_halvings=config.line_search_steps,
+    )
+    # A rejected step replays as standing still, also where its directions were not finite (0 times NaN is NaN).
+    replayed = jax.tree.map(lambda leaf: jnp.where(fraction > 0, leaf, 0.0), directions)
+    taken = PolicyStep(
+        policy_params=policy_params, directions=replayed, fraction=fraction, step_gap=step_gap, held_out=held_out
+    )
+    return unravel(new_params), taken, metrics | {"cost_weight": -weights[1]}
+
+
+def outer_problem(
+    config: Config, policy_apply: Callable[[PyTree, jax.Array], Gaussian], constraint: Constraint, taken: PolicyStep
+) -> Outer:
+    """The held-out samples, with the importance weights that the step would have had under another multiplier."""
+    held_out = taken.held_out
+    old_params, unravel = ravel_pytree(taken.policy_params)
+
+    def log_prob(params: jax.Array) -> jax.Array:
+        return distributions.log_prob(policy_apply(unravel(params), held_out.obs), held_out.action)
+
+    def importance_weights(multiplier: jax.Array) -> jax.Array:
+        weights = constraint.combine(multiplier, taken.step_gap, taken.directions.gram)
+        new_params = trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
+        return importance(log_prob(new_params), log_prob(old_params))
+
+    return Outer(reward_advantage=held_out.reward_advantage, cost=held_out.cost, importance_weights=importance_weights)

@@ -1,0 +1,182 @@
+"""Where the policy's reward comes from: a discriminator against the expert, or the task itself.
+
+Sign convention, stated once: logits h are high on the expert. The paper's D tends to 1 on the learner, so
+h = -logit(D) and its reward -log D is softplus(h): an expert-like learner earns more.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float
+
+from ccil_jax.acting import running_statistics
+from ccil_jax.acting.networks import Network
+from ccil_jax.acting.running_statistics import RunningStatistics
+from ccil_jax.config import Config
+from ccil_jax.learning.minibatches import minibatches
+from ccil_jax.learning.optimizers import adam
+from ccil_jax.types import ExpertData, Metrics, PyTree, Transition
+from envs.jax_tools import scan
+
+
+class RewardModel(NamedTuple):
+    """A reward and how it learns."""
+
+    init: Callable[[jax.Array], PyTree]  # key -> state
+    reward: Callable[[PyTree, Transition], jax.Array]  # state, [T, N] -> [T, N], state held fixed
+    update: Callable[[PyTree, Transition, jax.Array], tuple[PyTree, Metrics]]  # state, [T, N], key
+
+
+REWARD_FORMS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "softplus": jax.nn.softplus,  # -log D: always positive, so it favours long episodes
+    "logit": lambda logits: logits,
+    "log_sigmoid": jax.nn.log_sigmoid,  # log(1 - D): always negative, so it favours short episodes
+}
+
+
+def task() -> RewardModel:
+    """The environment's own reward."""
+    return RewardModel(
+        init=lambda key: (),
+        reward=lambda state, transition: transition.reward,
+        update=lambda state, transition, key: (state, {}),
+    )
+
+
+@struct.dataclass(kw_only=True)
+class Discriminator:
+    """Classifier of state-action pairs, expert against learner."""
+
+    params: PyTree
+    optimizer: PyTree
+    statistics: RunningStatistics  # of observations, learner's and expert's
+
+
+def classification_loss(
+    expert_logits: Float[Array, " E"], learner_logits: Float[Array, " L"], entropy_coefficient: Float[Array, ""] | float
+) -> Float[Array, ""]:
+    """Logistic loss, -(E_pi[log D] + E_E[log(1 - D)]), less an entropy bonus (equation 2 of the paper)."""
+    loss = jnp.mean(jax.nn.softplus(-expert_logits)) + jnp.mean(jax.nn.softplus(learner_logits))
+    logits = jnp.concatenate([expert_logits, learner_logits])
+    entropy = jnp.mean(jax.nn.softplus(logits) - jax.nn.sigmoid(logits) * logits)
+    return loss - entropy_coefficient * entropy
+
+
+def gradient_penalty(
+    logits: Callable[[jax.Array], jax.Array],
+    expert_inputs: Float[Array, "M D"],
+    learner_inputs: Float[Array, "M D"],
+    key: jax.Array,
+) -> Float[Array, ""]:
+    """Mean (|d logits / d input| - 1)^2 between random expert and learner inputs (Gulrajani et al. 2017).
+
+    It keeps the logits from growing steep where the classes part, so that the reward still tells a learner which way
+    the expert lies when none of its samples is taken for one.
+    """
+    mix = jax.random.uniform(key, (expert_inputs.shape[0], 1))
+    slopes = jax.vmap(jax.grad(logits))(mix * expert_inputs + (1 - mix) * learner_inputs)
+    # The small term: a vanishing slope must not have a NaN derivative.
+    return jnp.mean((jnp.sqrt(jnp.sum(slopes**2, axis=-1) + 1e-12) - 1) ** 2)
+
+
+def spectrally_normalized(network: Network) -> Network:
+    """The network with every kernel divided by its largest singular value (Miyato et al. 2018): Lipschitz 1 or less."""
+
+    def normalize(path: tuple[Any, ...], leaf: jax.Array) -> jax.Array:
+        return leaf / largest_singular_value(leaf) if path[-1].key == "kernel" else leaf
+
+    def apply(params: PyTree, inputs: jax.Array) -> jax.Array:
+        return network.apply(jax.tree_util.tree_map_with_path(normalize, params), inputs)
+
+    return Network(network.init, apply)
+
+
+def largest_singular_value(matrix: Float[Array, "N M"], num_iterations: int = 20) -> Float[Array, ""]:
+    """By power iteration from a fixed random vector (no LAPACK: see `test_no_seed_waits_for_anothers_thread`)."""
+
+    def iterate(right: jax.Array, _: None) -> tuple[jax.Array, None]:
+        image = matrix.T @ (matrix @ right)
+        return image / (jnp.linalg.norm(image) + 1e-12), None
+
+    start = jax.random.normal(jax.random.key(0), matrix.shape[1:], matrix.dtype)
+    right = jax.lax.stop_gradient(jax.lax.scan(iterate, start, None, length=num_iterations)[0])
+    left = jax.lax.stop_gradient(matrix @ right)
+    # Constant singular vectors: the derivative is that of u.W v, the outer product of the two, as it should be.
+    return (left / (jnp.linalg.norm(left) + 1e-12)) @ matrix @ right
+
+
+def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim: int) -> RewardModel:
+    """The adversarial reward of GAIL (Ho and Ermon 2016).
+
+    It judges the learner's actions as they were sampled. Once clipped as the environment executes them, all actions
+    beyond the range would earn alike, and a policy whose mean has left the range would have no way back.
+    """
+    optimizer = adam(config.discriminator_learning_rate)
+    if config.discriminator_regularizer == "spectral_norm":
+        network = spectrally_normalized(network)
+
+    def inputs(statistics: RunningStatistics, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.concatenate([running_statistics.normalize(statistics, obs), action], axis=-1)
+
+    def init(key: jax.Array) -> Discriminator:
+        params = network.init(key)
+        statistics = running_statistics.update(running_statistics.init(obs_dim), expert.obs)
+        return Discriminator(params=params, optimizer=optimizer.init(params), statistics=statistics)
+
+    def reward(state: Discriminator, transition: Transition) -> jax.Array:
+        logits = network.apply(state.params, inputs(state.statistics, transition.obs, transition.action))
+        return REWARD_FORMS[config.reward_form](logits)
+
+    def descend(
+        state: Discriminator, learner: tuple[jax.Array, jax.Array], key: jax.Array
+    ) -> tuple[Discriminator, Metrics]:
+        choice_key, penalty_key = jax.random.split(key)
+        indices = jax.random.randint(choice_key, (learner[0].shape[0],), 0, expert.obs.shape[0])
+        expert_obs, expert_action = expert.obs[indices], expert.action[indices]
+        statistics = running_statistics.update(state.statistics, jnp.concatenate([learner[0], expert_obs]))
+        expert_inputs, learner_inputs = inputs(statistics, expert_obs, expert_action), inputs(statistics, *learner)
+
+        def loss(params: PyTree) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+            logits = functools.partial(network.apply, params)
+            on_expert, on_learner = logits(expert_inputs), logits(learner_inputs)
+            value = classification_loss(on_expert, on_learner, config.discriminator_entropy_coefficient)
+            if config.discriminator_regularizer == "gradient_penalty":
+                penalty = gradient_penalty(logits, expert_inputs, learner_inputs, penalty_key)
+                value = value + config.gradient_penalty_coefficient * penalty
+            return value, (on_expert, on_learner)
+
+        (value, (on_expert, on_learner)), gradient = jax.value_and_grad(loss, has_aux=True)(state.params)
+        updates, optimizer_state = optimizer.update(gradient, state.optimizer)
+        new = Discriminator(
+            params=optax.apply_updates(state.params, updates), optimizer=optimizer_state, statistics=statistics
+        )
+        return new, {
+            "discriminator_loss": value,
+            "discriminator_accuracy_expert": jnp.mean(on_expert > 0),
+            "discriminator_accuracy_learner": jnp.mean(on_learner < 0),
+        }
+
+    def update(state: Discriminator, transition: Transition, key: jax.Array) -> tuple[Discriminator, Metrics]:
+        learner = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, transition.action))
+        order_key, expert_key = jax.random.split(key)
+        indices = minibatches(
+            order_key,
+            len(learner[0]),
+            minibatch_size=config.discriminator_minibatch_size,
+            num_epochs=config.discriminator_steps,
+        )
+
+        def step(state: Discriminator, minibatch: tuple[jax.Array, jax.Array]) -> tuple[Discriminator, Metrics]:
+            indices, key = minibatch
+            return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
+
+        state, metrics = scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
+        held_out = network.apply(state.params, inputs(state.statistics, expert.held_out_obs, expert.held_out_action))
+        return state, jax.tree.map(jnp.mean, metrics) | {"discriminator_accuracy_held_out": jnp.mean(held_out > 0)}
+
+    return RewardModel(init, reward, update)

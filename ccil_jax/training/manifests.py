@@ -1,0 +1,192 @@
+"""Manifests of checkpoints: what was saved, down to the SHA-256 of every array and of every file.
+
+A manifest is written last, whole or not at all: a step without one was not finished.
+"""
+
+import dataclasses
+import hashlib
+import json
+import operator
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from ccil_jax.config import Config, ConfigError, unused
+from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.versions import versions
+from ccil_jax.types import PyTree
+from envs.base import Environment
+from envs.jax_tools import numbers
+
+NAME = "manifest.json"
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint that cannot be written or trusted. The message names the file or array, and the remedy."""
+
+
+class DamageError(CheckpointError):
+    """A checkpoint that is not what was written."""
+
+
+def describe(tree: PyTree) -> dict[str, dict[str, Any]]:
+    """`{name: {dtype, shape, sha256}}` of every leaf; shapes alone where leaves have no values."""
+    found = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): _describe(leaf) for path, leaf in found}
+
+
+def _describe(leaf: Any) -> dict[str, Any]:
+    facts = {"dtype": str(leaf.dtype), "shape": list(leaf.shape)}
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return facts
+    values = np.ascontiguousarray(numbers(leaf))
+    return {**facts, "sha256": hashlib.sha256(values.tobytes()).hexdigest()}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Identity:
+    """Which training a checkpoint is of. What is None is not known, and is not compared.
+
+    Its runs are [len(configs) * num_seeds]: configuration after configuration, each with its seeds in turn.
+    """
+
+    configs: tuple[Config, ...]  # resolved
+    num_seeds: int | None = None  # of each configuration
+    seed: int | None = None  # of their keys
+    task: str | None = None
+    max_episode_steps: int | None = None
+    demonstrations: str | None = None  # SHA-256 of what is learnt from; "none" where the method does not imitate
+
+
+def identity_of(
+    configs: Sequence[Config], env: Environment, demonstrations: Demonstrations | None, num_seeds: int, seed: int
+) -> Identity:
+    """The identity of a training of resolved configurations."""
+    learnt_from = demonstrations if configs[0].row.imitates else None
+    return Identity(
+        configs=tuple(configs),
+        num_seeds=num_seeds,
+        seed=seed,
+        task=env.name,
+        max_episode_steps=env.max_episode_steps,
+        demonstrations="none" if learnt_from is None else demonstrations_sha256(learnt_from),
+    )
+
+
+def demonstrations_sha256(demonstrations: Demonstrations) -> str:
+    """Digest of every array that a learner sees, whatever file they came from."""
+    digest = hashlib.sha256()
+    for name in ("obs", "actions", "costs", "terminated", "truncated", "episode_ends"):
+        array = np.ascontiguousarray(getattr(demonstrations, name))
+        digest.update(f"{name} {array.dtype} {array.shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def write(folder: Path, state: PyTree, identity: Identity | None) -> None:
+    """Completes the step in `folder`, whose files hold `state`."""
+    content = {
+        "identity": None if identity is None else _plain(dataclasses.asdict(identity)),
+        "versions": versions(),
+        "device": jax.devices()[0].device_kind,
+        "arrays": describe(state),
+        "files": {str(path.relative_to(folder)): file_sha256(path) for path in _files(folder)},
+    }
+    temporary = folder / f".{NAME}.tmp"
+    with temporary.open("w", encoding="utf-8") as file:
+        json.dump({**content, "sha256": _sha256(content)}, file, indent=1)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(folder / NAME)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a step, whose other files are not looked at. Raises `DamageError` if it is not intact."""
+    path = folder / NAME
+    try:
+        content = json.loads(path.read_bytes())
+        sha256 = content.pop("sha256")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise DamageError(f"{path}: missing or damaged") from None
+    if sha256 != _sha256(content):
+        raise DamageError(f"{path}: damaged; it disagrees with its own digest")
+    plain: dict[str, Any] = content
+    return plain
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """The manifest of an intact step: every file is there and as it was written. Raises `DamageError`."""
+    content = read_manifest(folder)
+    present = {str(file.relative_to(folder)): file for file in _files(folder)}
+    for name, expected in content["files"].items():
+        if name not in present:
+            raise DamageError(f"{folder / name}: missing")
+        if file_sha256(present[name]) != expected:
+            raise DamageError(f"{folder / name}: damaged; it is not what was written")
+    if strange := sorted(set(present) - set(content["files"])):
+        raise DamageError(f"{folder / strange[0]}: was not there when the checkpoint was written")
+    return content
+
+
+def check_identity(folder: Path, manifest: Mapping[str, Any], identity: Identity | None, free: frozenset[str]) -> None:
+    """Raises `CheckpointError` where `identity` is not the manifest's, but for the fields `free` of configurations."""
+    saved = manifest.get("identity") or _identity_of_older(manifest)
+    if identity is None or saved is None:
+        return
+    now = _plain(dataclasses.asdict(identity))
+    for name in sorted(now.keys() - {"configs"}):
+        if now[name] is not None and saved.get(name) is not None and saved[name] != now[name]:
+            raise _other(folder, name, saved[name], now[name])
+    if saved.get("num_seeds") is not None and len(saved["configs"]) != len(now["configs"]):
+        raise _other(folder, "number of configurations", len(saved["configs"]), len(now["configs"]))
+    for config, before, after in zip(identity.configs, saved["configs"], now["configs"], strict=False):
+        for name in sorted((before.keys() | after.keys()) - free - set(unused(config))):
+            if before.get(name) != after.get(name):
+                raise _other(folder, name, before.get(name), after.get(name))
+
+
+def _identity_of_older(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What a manifest of version 0.1.0 before identities says: its first configuration."""
+    return {"configs": [manifest["config"]]} if manifest.get("config") else None
+
+
+def _other(folder: Path, name: str, saved: Any, now: Any) -> CheckpointError:
+    return CheckpointError(
+        f"{folder}: written with {name} {saved}, this run has {now}; continue with what it was written with, or begin "
+        "a new run in another folder"
+    )
+
+
+def check_arrays(folder: Path, manifest: Mapping[str, Any], tree: PyTree) -> None:
+    """Raises `CheckpointError` where an array's dtype or shape is not the manifest's, `DamageError` for its values."""
+    saved, now = manifest["arrays"], describe(tree)
+    for name in sorted(saved.keys() | now.keys()):
+        for fact in ("dtype", "shape"):
+            was, wanted = saved.get(name, {}).get(fact), now.get(name, {}).get(fact)
+            if was != wanted:
+                raise CheckpointError(
+                    f"{folder}: {name} was written with {fact} {was}, this program has {wanted}; "
+                    "use the version and configuration that it was written with, or begin a new run"
+                )
+        if "sha256" in now[name] and now[name]["sha256"] != saved[name]["sha256"]:
+            raise DamageError(f"{folder}: {name} does not hold the values that were written")
+
+
+def _files(folder: Path) -> list[Path]:
+    hidden = (NAME, f".{NAME}.tmp")
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in hidden)
+
+
+def _sha256(content: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(value: dict[str, Any]) -> dict[str, Any]:
+    """As it comes back from JSON: lists for tuples, Python's numbers for NumPy's."""
+    plain: dict[str, Any] = json.loads(json.dumps(value, default=operator.methodcaller("item")))
+    return plain

@@ -1,0 +1,207 @@
+"""What every launcher shares: one-line errors with exit status 2, and checks of output folders.
+
+Nothing here imports JAX, so help and wrong input are answered at once.
+"""
+
+import argparse
+import datetime
+import difflib
+import itertools
+import os
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ccil_jax.config import ConfigError
+from ccil_jax.demonstrations.trajectories import DemonstrationsError
+from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
+from experiments.cli import xla
+
+CONSOLE = "ccil"  # the command that an installation brings along; `experiments.cli.console` carries it out
+MAX_ERROR = 1000  # characters of an error message, which may quote a file
+
+
+class UsageError(ValueError):
+    """Wrong input. The message is one line that names the option or file and the remedy."""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose every complaint is one line; `--num_seeds` and `--num-seeds` are the same option."""
+
+    def __init__(self, name: str, description: str) -> None:
+        super().__init__(
+            prog=launcher_command(name),
+            usage=f"{launcher_command(name)} [options]",
+            description=description,
+            allow_abbrev=False,  # an abbreviation would change its meaning when options are added
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As in argparse, but suggests the nearest option for an unknown one."""
+        given = [_hyphenated(a) for a in (sys.argv[1:] if args is None else args)]
+        parsed, unknown = self.parse_known_args(given, namespace)
+        if unknown:
+            option = unknown[0].split("=")[0]
+            known = [o for o in self._option_string_actions if o.startswith("--")]
+            near = difflib.get_close_matches(option, known, n=1)
+            self.error(f"{option}: unknown; " + (f"did you mean {near[0]}?" if near else "see --help"))
+        return parsed
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program with exit status 2 and one line on stderr."""
+        self.exit(2, error_line(self.prog, message.removeprefix("argument ")))
+
+
+def error_line(program: str, message: str) -> str:
+    """The line on stderr by which `program` says what is wrong."""
+    line = " ".join(message.split())
+    line = "".join(c if c.isprintable() else "?" for c in line)  # text from a file may not steer the terminal
+    line = line if len(line) <= MAX_ERROR else f"{line[:MAX_ERROR]}..."
+    return f"{program}: error: {line}\n"
+
+
+def _hyphenated(token: str) -> str:
+    name, equals, value = token.partition("=")
+    return name.replace("_", "-") + equals + value if token.startswith("--") else token
+
+
+def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None], argv: Sequence[str] | None) -> int:
+    """Parses and runs; wrong input found later than parsing ends in the same one line and exit status 2."""
+    arguments = parser.parse_args(argv)
+    xla.widen_vectors()
+    xla.tune_gpus()
+    xla.keep_programs()
+    try:
+        return run(arguments) or 0
+    except (UsageError, ConfigError, DemonstrationsError) as error:
+        parser.error(str(error))
+    except OSError as error:
+        if error.errno not in DISK_IS_FULL:
+            raise
+        where = f"{error.filename}: " if error.filename else ""
+        parser.error(f"{where}{error.strerror}; make space and continue with --resume")
+
+
+def command() -> str:
+    """The command line of this process, quoted so that a shell repeats it."""
+    spec = getattr(sys.modules.get("__main__"), "__spec__", None)
+    if spec:
+        return shlex.join(["python", "-m", spec.name, *sys.argv[1:]])
+    if _is_console():
+        return shlex.join([CONSOLE, *sys.argv[1:]])
+    return shlex.join(["python", *sys.orig_argv[1:]])  # a script, with its folder, or the code after `-c`
+
+
+def launcher_command(name: str) -> str:
+    """What a person types to start the launcher `name`, in the way in which this process was started."""
+    return f"{CONSOLE} {name}" if _is_console() else f"python -m experiments.{name}"
+
+
+def _is_console() -> bool:
+    return Path(sys.argv[0]).name == CONSOLE
+
+
+def integer(text: str) -> int:
+    """An integer; 3000000, 3_000_000 and 3e6 are the same."""
+    value = float(text)
+    if not value.is_integer():
+        raise ValueError(text)
+    return int(value)
+
+
+def positive(text: str) -> int:
+    """An integer of at least 1."""
+    if integer(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
+    return integer(text)
+
+
+def natural(text: str) -> int:
+    """An integer that fits a 32-bit seed."""
+    if not 0 <= integer(text) < 2**32:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 0 and below 2**32")
+    return integer(text)
+
+
+def boolean(text: str) -> bool:
+    """Truth in the usual spellings."""
+    if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
+        raise argparse.ArgumentTypeError(f"{text!r}: give true or false")
+    return text.lower() in ("true", "yes", "1")
+
+
+def default_folder(task: str, method: str, option: str = "--out") -> Path:
+    """Makes `runs/<task>_<method>_<timestamp>`, with `-02` and so on after it where another run has that name.
+
+    Making the folder is what keeps two runs apart that begin in the same second. So call it when everything else has
+    been checked. Raises `UsageError` that names `option` if it cannot be made.
+    """
+    stamp = datetime.datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
+    first = folder = Path("runs") / f"{task}_{method}_{stamp}"
+    numbers = itertools.count(2)
+    try:
+        first.parent.mkdir(exist_ok=True)
+        while True:
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                folder = first.with_name(f"{first.name}-{next(numbers):02d}")
+            else:
+                return folder
+    except OSError as error:
+        raise _cannot_write(folder, option, error) from None
+
+
+def check_output_folder(
+    folder: Path, *, resume: bool = False, option: str = "--out", record: str = "config.json"
+) -> None:
+    """Makes `folder` and proves that it can be written. Raises `UsageError`, also where runs would be mixed.
+
+    A folder with a file `record` holds a run that can be resumed.
+    """
+    try:
+        holds_run = (folder / record).is_file()
+        # A process that was killed before it began leaves locks and temporary files, whose names begin with a dot.
+        occupied = folder.is_dir() and any(path for path in folder.rglob("*") if not _is_left_over(path))
+    except OSError as error:
+        raise UsageError(f"{option} {folder}: cannot be read ({error.strerror}); choose another folder") from None
+    if resume and not holds_run:
+        raise UsageError(f"--resume: {folder} holds no run (no {record}); leave --resume out or correct {option}")
+    if holds_run and not resume:
+        raise UsageError(f"{option} {folder}: already holds a run; continue it with --resume or choose another folder")
+    if occupied and not resume:
+        raise UsageError(f"{option} {folder}: not empty; choose a new folder")
+    if complaint := unfit_for_checkpoints(folder):
+        raise UsageError(f"{option} {folder}: {complaint}")
+    check_writable(folder, option)
+
+
+def _is_left_over(path: Path) -> bool:
+    return path.name.startswith(".") or (path.name == "checkpoints" and path.is_dir())
+
+
+def check_new_file(path: Path, option: str, *, overwrite: bool) -> None:
+    """Raises `UsageError` that names `option` where the file `path` would replace another, or a folder."""
+    if path.is_dir():
+        raise UsageError(f"{option} {path}: is a folder; give the name of a file")
+    if path.exists() and not overwrite:
+        raise UsageError(f"{option} {path}: exists; choose another name or add --overwrite")
+
+
+def check_writable(folder: Path, option: str) -> None:
+    """Makes `folder` and writes a byte in it. Raises `UsageError` that names `option`."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+    except OSError as error:
+        raise _cannot_write(folder, option, error) from None
+
+
+def _cannot_write(folder: Path, option: str, error: OSError) -> UsageError:
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    return UsageError(f"{option} {folder}: cannot be written ({reason}); choose another folder")

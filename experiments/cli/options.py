@@ -1,0 +1,165 @@
+"""Options that training launchers share: the `Config` fields, and what a run is besides its hyperparameters."""
+
+import argparse
+import contextlib
+import dataclasses
+import types
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+from ccil_jax.config import CHOICES, PRESETS, Config, ConfigError, Use, validate
+from ccil_jax.methods import METHODS
+from envs import registry
+from envs.registry import PHYSICS, TASKS, TaskInfo
+from experiments.cli.command_line import Parser, UsageError, boolean, integer, natural, positive
+
+CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
+TASK_OPTIONS = ("cost_threshold", "contact_cost")  # some tasks have them; None leaves them to the task
+METHOD_PRESETS = {"bc": "bc", "iq_learn": "iq_learn"}  # where a method starts from one of its own
+DEFAULTS: Mapping[str, Any] = {
+    "num_seeds": 3,
+    "seed": 0,
+    "one_by_one": False,
+    "physics": "auto",
+    **dict.fromkeys(TASK_OPTIONS),
+    "max_episode_steps": 1000,
+    "preset": "default",
+    "eval_episodes": 50,
+}
+
+
+def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> None:
+    """Everything in `DEFAULTS` and --env. What is not given is absent from the parsed arguments."""
+
+    def add(name: str, text: str, **settings: Any) -> None:
+        default = defaults.get(name)
+        suffix = "" if default is None else f" (default: {str(default).lower()})"
+        parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, help=text + suffix, **settings)
+
+    add("env", f"task: {', '.join(TASKS)}", metavar="TASK")
+    add("num_seeds", "seeds trained side by side in one program", type=positive, metavar="S")
+    add("seed", "base seed: the same seed, number of seeds and versions give the same bits", type=natural, metavar="N")
+    add(
+        "one_by_one",
+        "whether a device takes its seeds in turn: its bits then depend neither on the number of seeds nor on that of "
+        "cores (runs in turn do not fill a GPU)",
+        type=boolean,
+        metavar="BOOL",
+    )
+    add("preset", "hyperparameters to start from", choices=tuple(PRESETS))
+    add("physics", "engine; auto: native on CPUs, warp on NVIDIA GPUs if installed, else mjx", choices=PHYSICS)
+    add("cost_threshold", "per-step threshold of the 0/1 cost (default: the task's)", type=float, metavar="X")
+    add(
+        "contact_cost",
+        "whether contacts count in the cost (Ant, Humanoid; default: true)",
+        type=boolean,
+        metavar="BOOL",
+    )
+    add("max_episode_steps", "time limit of an episode", type=positive, metavar="T")
+    add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
+
+
+def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = tuple(METHODS)) -> None:
+    """One option per `Config` field but the method, grouped by who uses them; `--help` shows the preset's values.
+
+    A field that none of `methods` uses is left out of `--help`; given all the same, it is refused with the reason. What
+    is not given is absent from the parsed arguments.
+    """
+    parser.epilog = (
+        "static: shapes the program, so that a change compiles it anew; all other numbers may vary within it"
+    )
+    groups: dict[Use, Any] = {}
+    defaults = Config(**PRESETS[preset])
+    for field in dataclasses.fields(Config):
+        if field.name == "method":
+            continue
+        use: Use = field.metadata["use"]
+        if use not in groups:
+            groups[use] = parser.add_argument_group(f"hyperparameters of {use.who}")
+        choices = f"; one of {', '.join(CHOICES[field.name])}" if field.name in CHOICES else ""
+        value = getattr(defaults, field.name)
+        default = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        static = "" if field.metadata["traced"] else "; static"
+        text = f"{field.metadata['help']}{choices} (default: {default.lower()}{static})".replace("%", "%%")
+        groups[use].add_argument(
+            "--" + field.name.replace("_", "-"),
+            dest=field.name,
+            type=_parser_of(field.type),
+            default=argparse.SUPPRESS,
+            metavar="X",
+            help=text if not set(use.methods).isdisjoint(methods) else argparse.SUPPRESS,
+        )
+
+
+def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] = MappingProxyType({})) -> Config:
+    """The preset, then what a run that is resumed has `saved`, then the options given, validated.
+
+    Raises:
+        ConfigError: also for an option given that makes no difference to the run.
+    """
+    base, changes = ({k: v for k, v in fields.items() if k in CONFIG_FIELDS} for fields in (saved, given))
+    with errors_name_options():
+        config = Config.from_base({**PRESETS[preset], **base}, changes)
+        validate(config)
+    return config
+
+
+@contextlib.contextmanager
+def errors_name_options() -> Iterator[None]:
+    """Has a `ConfigError` speak of options as they are typed, `--max-kl`, and not of fields, `--max_kl`."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(_with_hyphens(str(error))) from None
+
+
+def find_task(name: str | None, option: str = "--env") -> TaskInfo:
+    """The description of a task. Raises `UsageError` with the nearest name for an unknown one."""
+    if name is None:
+        raise UsageError(f"{option}: required; one of {', '.join(TASKS)}")
+    try:
+        return registry.find_task(name)
+    except ValueError as error:
+        raise UsageError(f"{option} {error}") from None
+
+
+def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
+    """What `envs.make` gets besides task and physics, nothing left to a default. Raises `UsageError`."""
+    threshold = choices["cost_threshold"]
+    if threshold is not None and not 0 <= threshold < float("inf"):
+        raise UsageError(f"--cost-threshold {threshold}: must be finite and not negative")
+    given = {name: choices[name] for name in TASK_OPTIONS if choices[name] is not None}
+    for name in given.keys() - task.options.keys():
+        raise UsageError(f"--{name.replace('_', '-')}: {task.name} has no such option; leave it out")
+    return {**task.options, **given, "max_episode_steps": choices["max_episode_steps"]}
+
+
+def _with_hyphens(message: str) -> str:
+    for name in CONFIG_FIELDS:
+        message = message.replace(f"--{name}", "--" + name.replace("_", "-"))
+    return message
+
+
+def _parser_of(annotation: Any) -> Callable[[str], Any]:
+    if typing.get_origin(annotation) is tuple:
+        return _sizes
+    if isinstance(annotation, types.UnionType):
+        return _number
+    parsers: dict[type, Callable[[str], Any]] = {int: integer, bool: boolean, float: float, str: str}
+    return parsers[annotation]
+
+
+def _sizes(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(integer(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give sizes such as 100,100") from None
+
+
+def _number(text: str) -> float | None:
+    try:
+        return None if text.lower() == "none" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a number or none") from None

@@ -1,0 +1,87 @@
+"""Progress of a training run: a live bar on a terminal, plain lines elsewhere (logs, pipes)."""
+
+import sys
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from experiments.runs.intervals import known_mean
+from experiments.runs.summary import number
+
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+class Display:
+    """Shows return, cost against its limit, multiplier, speed and time left; use it as a context manager."""
+
+    def __init__(self, title: str, num_iterations: int, cost_limit: float | None, *, has_multiplier: bool) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        # Names of folders are shown as they are: no markup, no emoji.
+        self._console = Console(file=sys.stderr, soft_wrap=True, markup=False, emoji=False)
+        self._cost_limit = cost_limit
+        self._has_multiplier = has_multiplier
+        self._title = title
+        self._started = self._last_line = time.monotonic()
+        self._first_iteration: int | None = None
+        self._bar: Any = None
+        if self._console.is_terminal:
+            columns = (
+                TextColumn("{task.description}", markup=False),
+                BarColumn(bar_width=None),
+                MofNCompleteColumn(),
+                TextColumn("{task.fields[status]}", markup=False),
+                TimeRemainingColumn(),
+            )
+            self._bar = Progress(*columns, console=self._console, expand=True)
+            self._task = self._bar.add_task(title, total=num_iterations, status="compiling ...")
+
+    def message(self, text: str) -> None:
+        """Prints one line above the bar."""
+        self._console.print(text, highlight=False)
+
+    def update(self, progress: Any) -> None:
+        """Shows a `ccil_jax.training.runner.Progress`."""
+        now = time.monotonic()
+        if self._first_iteration is None:
+            self._first_iteration, self._started = progress.iteration, now
+            self.message(f"compiled in {progress.compile_seconds:.1f} s")
+        status = self._status(progress)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=progress.iteration, status=status)
+        elif progress.iteration == progress.num_iterations or now - self._last_line >= _SECONDS_BETWEEN_LINES:
+            self._last_line = now
+            left = self._time_left(progress, now)
+            self.message(f"{self._title} {progress.iteration}/{progress.num_iterations}  {status}{left}")
+
+    def _status(self, progress: Any) -> str:
+        latest = {name: float(known_mean(np.asarray(rows[-1]), axis=0)) for name, rows in progress.metrics.items()}
+        limit = "" if self._cost_limit is None else f" / {number(self._cost_limit)}"
+        if "episode_return" not in latest:  # behaviour cloning: it does not act while it learns
+            return f"loss {number(latest['loss'])}  held out {number(latest['held_out_loss'])}"
+        parts = [f"return {number(latest['episode_return'])}", f"cost {number(latest['episode_cost'])}{limit}"]
+        if self._has_multiplier:
+            parts.append(f"lambda {number(latest['multiplier'])}")
+        parts.append(f"{progress.env_steps_per_second:,.0f} steps/s")
+        return "  ".join(parts)
+
+    def _time_left(self, progress: Any, now: float) -> str:
+        done = progress.iteration - (self._first_iteration or 0)
+        if done <= 0:
+            return ""
+        seconds = round((now - self._started) / done * (progress.num_iterations - progress.iteration))
+        return f"  {seconds // 60}:{seconds % 60:02d} left"
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()

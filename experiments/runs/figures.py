@@ -1,0 +1,222 @@
+"""Learning curves as PNG files: mean and standard deviation over seeds, with the level of the demonstrations drawn."""
+
+import base64
+import dataclasses
+import html
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.runs import run_folder
+from experiments.runs.intervals import known_deviation, known_mean
+from experiments.runs.labels import literal
+
+PANELS = (
+    ("episode_return", "Return"),
+    ("episode_cost", "Cost per episode"),
+    ("cost_rate", "Cost rate"),
+)
+CLONING_PANELS = (  # of a method that does not act while it learns
+    ("loss", "Loss, nats"),
+    ("held_out_loss", "Loss on held-out steps, nats"),
+)
+_DEMONSTRATIONS, _ERROR, _LIMIT = _LEVEL_LABELS = ("mean of the demonstrations", "its standard error", "cost limit")
+_MAX_POINTS = 100  # of a curve: few episodes end in an iteration, and their scatter would hide the learning
+COLORS = ("#0b6e99", "#d1495b", "#6a994e", "#e09f3e", "#7b5ea7", "#3d405b", "#00a5a5", "#a44a3f")
+STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#8a8f98",
+    "axes.grid": True,
+    "grid.color": "#e7e9ec",
+    "grid.linewidth": 0.8,
+    "axes.axisbelow": True,
+    "xtick.color": "#4a4f57",
+    "ytick.color": "#4a4f57",
+    "legend.frameon": False,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """One run's metrics, [num_iterations, num_seeds] each, and the levels to draw beside them (None: unknown)."""
+
+    label: str
+    metrics: Mapping[str, np.ndarray]
+    expert_levels: Mapping[str, float | None]  # by metric name
+    cost_limit: float | None
+    expert_errors: Mapping[str, float | None] = dataclasses.field(default_factory=dict)  # their standard errors
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Environment steps that an iteration takes; 0 where it is a pass over the demonstrations."""
+        return int(self.metrics["env_steps"][0, 0])
+
+    @property
+    def window(self) -> int:
+        """Iterations behind one point of the curve."""
+        return -(-len(self.metrics["env_steps"]) // _MAX_POINTS)
+
+
+def read_curve(folder: Path, label: str | None = None) -> Curve:
+    """The curve of a run folder. Raises `UsageError` for a folder without metrics."""
+    run = run_folder.read_run(folder)
+    cost, length = run.facts["expert_cost"], run.facts["expert_length"]
+    return Curve(
+        label=label or run.config.method,
+        metrics=run_folder.read_metrics(folder),
+        expert_levels={
+            "episode_return": run.facts["expert_return"],
+            "episode_cost": cost,
+            "cost_rate": cost / length if length else None,
+        },
+        cost_limit=run.config.prescribed_limit,
+        expert_errors={
+            name: run.facts.get(f"{level}_standard_error")  # earlier versions do not say
+            for name, level in (("episode_return", "expert_return"), ("episode_cost", "expert_cost"))
+        },
+    )
+
+
+def draw_run(folder: Path) -> Path:
+    """Writes figures/curves.png (three panels) and one file per panel; returns the path of the first."""
+    curve = read_curve(folder)
+    task = run_folder.read_run(folder).facts["task"]
+    target = folder / "figures"
+    target.mkdir(exist_ok=True)
+    for panel in panels_of([curve]):
+        (target / f"{panel.metric}.png").write_bytes(png(draw_panels([curve], task, [panel.metric])))
+    path = target / "curves.png"
+    path.write_bytes(png(draw_panels([curve], task)))
+    return path
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """One metric of those runs that have it and whose iterations are of one kind: they share an axis."""
+
+    metric: str
+    title: str
+    curves: Mapping[int, Curve]  # by their place among all curves, which decides on their colour
+    by_passes: bool  # over the demonstrations; the others take environment steps
+
+
+def panels_of(curves: Sequence[Curve]) -> list[Panel]:
+    """The panels that at least one of the curves has something to show in."""
+    found = []
+    for metric, title in PANELS + CLONING_PANELS:
+        for by_passes in (False, True):
+            own = {
+                i: c for i, c in enumerate(curves) if metric in c.metrics and (c.steps_per_iteration == 0) is by_passes
+            }
+            if own:
+                found.append(Panel(metric, title, own, by_passes))
+    return found
+
+
+def draw_panels(curves: Sequence[Curve], task: str, names: Sequence[str] | None = None) -> Figure:
+    """One panel per metric that the runs have (or for each of `names`), all runs overlaid."""
+    panels = [panel for panel in panels_of(curves) if names is None or panel.metric in names]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.1 * len(panels) + 0.3, 3.9), dpi=150, layout="constrained")
+        entries: dict[str, Any] = {}  # of the legend: explicit, as matplotlib hides labels with a leading underscore
+        for axes, panel in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
+            entries = _draw_panel(axes, panel) | entries
+        _decorate(figure, curves, task)
+        order = sorted(entries, key=[*(c.label for c in curves), *_LEVEL_LABELS].index)
+        figure.legend([entries[x] for x in order], [literal(x) for x in order], loc="outside lower center", ncols=6)
+    return figure
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as the bytes of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def html_image(image: bytes, text: str) -> str:
+    """An `img` element that holds the PNG file itself; `text` stands for it where it is not shown."""
+    source = f"data:image/png;base64,{base64.b64encode(image).decode()}"
+    return f"<img alt='{html.escape(text, quote=True)}' src='{source}'>"
+
+
+def binned(values: np.ndarray, window: int) -> np.ndarray:
+    """Means over `window` rows in turn, the last over what is left: [T, ...] -> [ceil(T / window), ...]; NaN stays."""
+    starts = np.arange(0, len(values), window)
+    counts = np.diff([*starts, len(values)]).reshape(-1, *[1] * (values.ndim - 1))
+    means: np.ndarray = np.add.reduceat(values, starts, axis=0, dtype=np.float64) / counts
+    return means
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Any]:
+    """Draws curves and levels; returns the entries of the legend by their labels."""
+    steps = {curve.steps_per_iteration for curve in panel.curves.values()}
+    entries = {
+        curve.label: _draw_curve(axes, curve, panel.metric, COLORS[i % len(COLORS)], by_iteration=len(steps) == 1)
+        for i, curve in panel.curves.items()
+    }
+    entries |= _draw_levels(axes, list(panel.curves.values()), panel.metric)
+    axes.set_title(panel.title)
+    if panel.by_passes:
+        axes.set_xlabel("passes over the demonstrations")
+    else:
+        axes.set_xlabel(f"iterations of {min(steps):,} steps" if len(steps) == 1 else "environment steps per seed")
+    return entries
+
+
+def _draw_curve(axes: Axes, curve: Curve, name: str, color: str, *, by_iteration: bool) -> Any:
+    values = curve.metrics[name]  # [num_iterations, num_seeds]
+    x = np.arange(1, len(values) + 1) if by_iteration else curve.metrics["env_steps"][:, 0]
+    x, values = binned(x, curve.window), binned(values, curve.window)
+    mean, deviation = known_mean(values, axis=1), known_deviation(values, axis=1)
+    if values.shape[1] > 1:
+        axes.plot(x, values, color=color, linewidth=0.7, alpha=0.35)
+        axes.fill_between(x, mean - deviation, mean + deviation, color=color, alpha=0.18, linewidth=0)
+    return axes.plot(x, mean, color=color, linewidth=2.0)[0]
+
+
+def _draw_levels(axes: Axes, curves: Sequence[Curve], name: str) -> dict[str, Any]:
+    entries: dict[str, Any] = {}
+    levels = {(c.expert_levels.get(name), c.expert_errors.get(name)) for c in curves}
+    for level, error in levels:
+        if level is None:
+            continue
+        line = axes.axhline(level, color="#22262b", linewidth=1.3, linestyle=(0, (5, 3)))
+        entries.setdefault(_DEMONSTRATIONS, line)
+        if error is not None:
+            band = axes.axhspan(level - error, level + error, color="#22262b", alpha=0.13, linewidth=0)
+            entries.setdefault(_ERROR, band)
+    limits = {c.cost_limit for c in curves if c.cost_limit is not None} if name == "episode_cost" else ()
+    for limit in limits:
+        line = axes.axhline(limit, color="#a0281f", linewidth=1.3, linestyle=(0, (1, 2)))
+        entries.setdefault(_LIMIT, line)
+    if name in ("episode_cost", "cost_rate"):
+        axes.set_ylim(bottom=0.0)  # costs are not negative, and a band below zero would mislead
+    return entries
+
+
+def _decorate(figure: Figure, curves: Sequence[Curve], task: str) -> None:
+    counts = sorted({c.metrics["env_steps"].shape[1] for c in curves})
+    seeds = " or ".join(map(str, counts))
+    what = "one seed" if counts == [1] else f"mean and standard deviation over {seeds} seeds"
+    windows = sorted({(c.window, "iterations" if c.steps_per_iteration else "passes") for c in curves if c.window > 1})
+    points = f"; each point: {' or '.join(f'{count} {unit}' for count, unit in windows)}" if windows else ""
+    figure.suptitle(
+        literal(f"{task}: {what}{points}"),
+        x=0.008,
+        horizontalalignment="left",
+        fontsize=10.5,
+        color="#4a4f57",
+    )

@@ -1,0 +1,111 @@
+"""Demonstrations of a finished run's policy: whose they are, and what their file says about it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.config import Config
+from ccil_jax.demonstrations.trajectories import Demonstrations
+from experiments.cli.command_line import UsageError
+from experiments.runs import run_folder
+from experiments.runs.run_folder import Run
+from experiments.runs.summary import number, show, with_error
+
+_SCORES = ("episode_return", "episode_cost", "episode_length")
+
+
+def cost_limit(run: Run) -> float | None:
+    """The episode cost that the run's method had to keep; None for a method without a limit."""
+    limits = {"prescribed": run.config.cost_limit, "demonstrations": run.facts["expert_cost"], None: None}
+    limit: float | None = limits[run.config.row.limit]
+    return limit
+
+
+def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int | None:
+    """The seed with the highest return among those within the limit; None if there is none."""
+    allowed = [row for row in rows if cost_limit is None or row["episode_cost"] <= cost_limit]
+    return max(allowed, key=lambda row: row["episode_return"])["seed"] if allowed else None
+
+
+def read_summary(run: Run) -> dict[str, Any]:
+    """What a finished run achieved. Raises `UsageError` if the run is not finished."""
+    path, config = run.folder / "summary.json", run.config
+    unfinished = f"--record: the run in {run.folder} is not finished; continue it with --resume"
+    if not path.is_file():
+        raise UsageError(unfinished)
+    summary = run_folder.read_json(path)
+    try:
+        numbers = [row[name] for row in summary["per_seed"] for name in ("seed", *_SCORES)]
+        numbers += [summary[name] for name in ("env_steps", "random_return", "random_cost")]
+        is_whole = all(isinstance(number, int | float) for number in numbers) and numbers[:-3] != []
+    except (KeyError, TypeError):
+        is_whole = False
+    if not is_whole:
+        raise UsageError(f"{path}: numbers are missing; repeat the evaluation with --resume")
+    given_up = all((run.folder / f"fault_seed_{row['seed']}.npz").is_file() for row in summary["per_seed"])
+    if summary["env_steps"] < config.num_iterations * config.steps_per_iteration and not given_up:
+        raise UsageError(unfinished)  # it was continued for longer, so the summary is of an older policy
+    return summary
+
+
+def facts(run: Run, summary: Mapping[str, Any], seed_index: int, command: str) -> dict[str, Any]:
+    """What a reader of the demonstrations needs to know; `command` is what made them, one command a line."""
+    (row,) = [row for row in summary["per_seed"] if row["seed"] == seed_index]
+    limit = cost_limit(run)
+    return {
+        "task": run.facts["task"],
+        "method": run.config.method,
+        "cost_limit": limit,
+        "limit_kept": None if limit is None else row["episode_cost"] <= limit,
+        **run.facts["env_options"],
+        "physics": run.facts["physics"],
+        "env_steps": summary["env_steps"],
+        "seed": run.facts["seed"],
+        "seed_index": seed_index,
+        "evaluation": {name: row[name] for name in _SCORES},
+        "random_policy": {name: summary[f"random_{name}"] for name in ("return", "cost")},
+        "trained_with": {name: run.facts.get(name) for name in ("versions", "git_commit")},
+        **run_folder.provenance(),
+        "command": command,
+    }
+
+
+def record(
+    config: Config, agents: Any, env: Any, *, num_trajectories: int, episode_seed: int, facts: Mapping[str, Any]
+) -> Demonstrations:
+    """Rolls out the policy of the seed that `facts` names; `agents` is [num_seeds]-leading."""
+    import jax
+
+    from ccil_jax.acting import evaluation
+
+    return evaluation.record(
+        config,
+        jax.tree.map(lambda leaf: leaf[facts["seed_index"]], agents),
+        env,
+        num_episodes=num_trajectories,
+        seed=episode_seed,
+        metadata={**facts, "episode_seed": episode_seed},
+    )
+
+
+def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
+    """One table: each recorded trajectory's length, return and cost, and their means beside the limit."""
+    from rich.table import Table
+
+    returns = demonstrations.episode_returns
+    table = Table(title="recorded demonstrations", title_justify="left")
+    for heading in ("", "return", "cost", "steps"):
+        table.add_column(heading, justify="right" if heading else "left")
+    costs, lengths = demonstrations.episode_costs, demonstrations.episode_lengths
+    for i, (cost, length) in enumerate(zip(costs, lengths, strict=True)):
+        table.add_row(f"trajectory {i}", number(None if returns is None else returns[i]), number(cost), str(length))
+    table.add_section()
+    mean_return = with_error(demonstrations.mean_episode_return, demonstrations.return_standard_error)
+    mean_cost = with_error(demonstrations.mean_episode_cost, demonstrations.cost_standard_error)
+    table.add_row("mean +- standard error", mean_return, mean_cost, number(demonstrations.mean_episode_length))
+    random = demonstrations.metadata["random_policy"]
+    table.add_row("random policy", number(random["return"]), number(random["cost"]), "")
+    if demonstrations.metadata["cost_limit"] is not None:
+        table.add_row("limit", "", number(demonstrations.metadata["cost_limit"]), "")
+    show(table)
+    print(f"demonstrations  {path}")

@@ -1,0 +1,48 @@
+"""What `--resume` needs to know: the choices of the run in a folder, and that the options given agree with them."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.config import relevant
+from ccil_jax.training.filesystem import file_sha256
+from experiments.cli import options
+from experiments.cli.command_line import UsageError
+from experiments.runs import run_folder
+
+
+def resumed(
+    folder: Path | None, given: Mapping[str, Any], option: str = "--out", movable: Collection[str] = ()
+) -> dict[str, Any]:
+    """The choices of the run in `folder`, with `demos` as a path. Raises `UsageError` where `given` disagrees.
+
+    `env_steps` may differ, upwards, as a finished run can be trained for longer, and so may the fields `movable`.
+    """
+    if folder is None:
+        raise UsageError(f"--resume: needs {option} with the folder of the run to continue")
+    if not (folder / "config.json").is_file():
+        raise UsageError(f"--resume: {folder} holds no run (no config.json); leave --resume out or correct {option}")
+    run = run_folder.read_run(folder)
+    demos = run.facts["demonstrations"]
+    saved = {
+        **relevant(run.config),
+        **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
+        "one_by_one": run.facts.get("one_by_one", False),  # older runs do not say
+        **dict.fromkeys(options.TASK_OPTIONS),  # where the task has none; else:
+        **run.facts["env_options"],
+        "env": run.facts["task"],
+        "num_demos": demos["num_episodes"] if demos else None,
+    }
+    for name, value in given.items():
+        if name in ("demos", *movable) or name not in saved:  # what makes no difference to the run is refused later
+            continue
+        longer = name == "env_steps" and value > saved[name]
+        if value != saved[name] and not longer:
+            raise UsageError(
+                f"--{name.replace('_', '-')} {value}: the run in {folder} has {saved[name]}; leave it out to resume"
+            )
+    # A file that was moved may be named again: its digest decides.
+    path: Path | None = given.get("demos", Path(demos["file"]) if demos else None)
+    if path and path.is_file() and demos and file_sha256(path) != demos["sha256"]:
+        raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")
+    return {**saved, "demos": path}

@@ -1,0 +1,1 @@
+"""How fast the program is, beside the engine alone and beside other libraries."""

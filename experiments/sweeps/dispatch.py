@@ -1,0 +1,110 @@
+"""What `sweep` and `ablations` share: carrying out variants in few programs, and finding them again."""
+
+import argparse
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ccil_jax.training.versions import versions
+from experiments.cli import command_line
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import run_folder
+from experiments.sweeps import backends, variants
+from experiments.sweeps.variants import Program, Variant
+
+_INTERRUPTED = 130  # exit status after Ctrl-C, as of shells
+
+
+def add_options(parser: Parser) -> None:
+    """Where and how programs are carried out, and where the results go."""
+    default = max(1, len(backends.usable_cpus()) // 2)
+    parser.add_argument(
+        "--workers",
+        type=command_line.positive,
+        default=default,
+        metavar="N",
+        help=f"programs at a time; those of one machine share its CPUs (default: one for two CPUs, {default} here)",
+    )
+    parser.add_argument("--launcher", choices=backends.LAUNCHERS, default="processes", help="who carries programs out")
+    parser.add_argument(
+        "--slurm",
+        nargs="+",
+        type=_setting,
+        default=[],
+        metavar="NAME=VALUE",
+        help="parameters of submitit's executor, such as cpus_per_task=8 timeout_min=600 slurm_partition=cpu",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for runs, table and figure")
+    parser.add_argument("--resume", action="store_true", help="finish what is missing in --out")
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    name, equals, value = text.partition("=")
+    if not (name.isidentifier() and equals):
+        raise argparse.ArgumentTypeError(f"{text!r}: give NAME=VALUE")
+    return name, int(value) if value.isdigit() else value
+
+
+def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: str, choices: Mapping[str, Any]) -> int:
+    """Trains what is not finished yet; returns how many programs failed.
+
+    Args:
+        chosen: all variants.
+        arguments: those of `add_options`.
+        record: name of the file in --out that keeps `choices`.
+        choices: what the study is; a folder that holds others is refused.
+
+    Raises:
+        UsageError: before anything has begun.
+    """
+    out: Path = arguments.out
+    backends.check_launcher(arguments.launcher)
+    if arguments.slurm and arguments.launcher != "slurm":
+        raise UsageError(
+            f"--slurm: --launcher {arguments.launcher} does not use it; leave it out, or add --launcher slurm"
+        )
+    command_line.check_output_folder(out, resume=arguments.resume, record=record)
+    if arguments.resume:
+        _check_choices(out / record, choices)
+    for variant in chosen:
+        variants.check_unchanged(variant)
+    all_programs = variants.group(chosen, out)
+    # A program keeps its variants, so that what is missing goes on from the checkpoints that hold them all.
+    programs = [program for program in all_programs if not all(variant.finished for variant in program.variants)]
+    num_runs = sum(variant.plan.num_seeds for variant in chosen)
+    done = f", {len(programs)} of them unfinished" if arguments.resume else ""
+    print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_programs)} programs{done}", flush=True)
+    facts = {"command": command_line.command(), "versions": versions()}
+    run_folder.write_json(out / record, {**facts, "git_commit": run_folder.git_commit(), "choices": choices})
+    for program in programs:
+        variants.write_program(program)
+    return _wait(programs, arguments)
+
+
+def _check_choices(path: Path, choices: Mapping[str, Any]) -> None:
+    saved = run_folder.read_json(path).get("choices", {})
+    for name in {**saved, **choices}:
+        if saved.get(name) != choices.get(name):
+            raise UsageError(
+                f"--resume: {name} is {choices.get(name)!r}, but {saved.get(name)!r} in {path}; choose another --out"
+            )
+
+
+def _wait(programs: Sequence[Program], arguments: argparse.Namespace) -> int:
+    start, num_failed = time.monotonic(), 0
+    by_folder = {program.folder: program for program in programs}
+    outcomes = backends.launch(
+        arguments.launcher, list(by_folder), arguments.workers, arguments.out / "slurm", dict(arguments.slurm)
+    )
+    try:
+        for i, (folder, failure) in enumerate(outcomes, 1):
+            names = " ".join(variant.name for variant in by_folder[folder].variants)
+            state = "done" if failure is None else f"FAILED ({failure})"
+            print(f"[{i}/{len(programs)}] {time.monotonic() - start:,.0f} s: {names}: {state}", flush=True)
+            num_failed += failure is not None
+    except KeyboardInterrupt:
+        print("stopped; continue with --resume", file=sys.stderr)
+        raise SystemExit(_INTERRUPTED) from None
+    return num_failed

@@ -1,0 +1,162 @@
+"""Variants of a training run, and the programs that train those together which differ in traced fields alone.
+
+    OUT/runs/<variant>/         a run folder like that of `train`
+    OUT/programs/<program>/     program.json, worker.log and the checkpoints of all its runs together
+
+A variant is a list of `train` options, so a program is handed to whatever process will carry it out as plain text.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ccil_jax.config import Config, field_names, relevant
+from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
+from ccil_jax.training.filesystem import file_sha256
+from experiments import train
+from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import run_folder
+from experiments.runs.execution import Plan
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Variant:
+    """One configuration with its seeds."""
+
+    name: str  # and its folder's
+    options: tuple[str, ...]  # of `train`
+    plan: Plan
+    alone: bool = False  # wants a program of its own, as its speed is of interest
+
+    @property
+    def finished(self) -> bool:
+        """Whether its run folder is complete."""
+        return (self.plan.folder / "summary.json").is_file()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Program:
+    """Variants that are trained together."""
+
+    folder: Path
+    variants: tuple[Variant, ...]
+
+
+class _OptionParser(Parser):
+    """The options of `train` as a table of fields: complaints are raised."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(" ".join(message.split()).removeprefix("argument "))
+
+
+def make_variant(
+    name: str,
+    fields: Mapping[str, Any],
+    out: Path,
+    *,
+    load: Callable[[Path], Demonstrations] = load_demonstrations,
+    alone: bool = False,
+) -> Variant:
+    """The variant with these `train` options. Raises `UsageError`, `ConfigError` or `DemonstrationsError`.
+
+    `load` reads a file of demonstrations; a cached one is given where many variants share a file.
+    """
+    if "demos" in fields:  # a worker may be started elsewhere
+        try:
+            fields = {**fields, "demos": Path(fields["demos"]).resolve()}
+        except (TypeError, ValueError):
+            raise UsageError(f"--demos {fields['demos']!r}: give the name of a file") from None
+    return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, load, alone=alone)
+
+
+def _variant(
+    name: str, given: Sequence[str], out: Path, load: Callable[[Path], Demonstrations], *, alone: bool = False
+) -> Variant:
+    parser = _OptionParser("train", "")
+    train.add_options(parser)
+    folder = out / "runs" / name
+    resume = (folder / "config.json").is_file()
+    plan = train.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
+    return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
+
+
+def text(value: Any) -> str:
+    """A value as it is typed on a command line."""
+    if isinstance(value, list | tuple):
+        return ",".join(map(text, value))
+    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
+
+
+def check_unchanged(variant: Variant) -> None:
+    """Raises `UsageError` where the variant's folder holds a run of other choices."""
+    plan = variant.plan
+    if not plan.resume:
+        return
+    run = run_folder.read_run(plan.folder)
+    chosen = {**relevant(plan.config), "task": plan.task, "seed": plan.seed, "num_seeds": plan.num_seeds}
+    chosen |= {name: getattr(plan, name) for name in ("eval_episodes", "env_options", "one_by_one")}
+    saved = {**run.facts, **dataclasses.asdict(run.config)}
+    for name, value in chosen.items():
+        if saved.get(name, value) != value:  # an older version may not say
+            raise UsageError(f"--resume: {plan.folder} has {name} {saved[name]}, not {value}; choose another --out")
+    demos = run.facts["demonstrations"]
+    if demos and plan.demonstrations_path and file_sha256(plan.demonstrations_path) != demos["sha256"]:
+        raise UsageError(f"--resume: {plan.folder} began with other demonstrations than {plan.demonstrations_path}")
+
+
+def run_of(variant: Variant) -> Hashable:
+    """What a variant trains, whatever it is called: two that are equal would train the same."""
+    return _shared(variant.plan), variant.plan.config
+
+
+def group(variants: Iterable[Variant], out: Path) -> list[Program]:
+    """The programs of these variants, in the order of their first ones."""
+    groups: dict[Any, list[Variant]] = {}
+    for variant in variants:
+        groups.setdefault((_shared(variant.plan), variant.name if variant.alone else ""), []).append(variant)
+    return [_program(members, out) for members in groups.values()]
+
+
+def static_part(config: Config) -> tuple[Any, ...]:
+    """The values that shape a program."""
+    return tuple(getattr(config, name) for name in field_names(traced=False))
+
+
+def _shared(plan: Plan) -> tuple[Any, ...]:
+    """What the plans of one program have in common."""
+    expert = (plan.demonstrations_path, plan.demonstrations.num_episodes if plan.demonstrations else 0)
+    names = ("task", "physics", "num_seeds", "seed", "one_by_one", "eval_episodes")
+    return static_part(plan.config), str(plan.env_options), expert, *(getattr(plan, name) for name in names)
+
+
+def _program(variants: Sequence[Variant], out: Path) -> Program:
+    # Named after its contents: with other variants it is another program, whose checkpoints would not fit.
+    digest = hashlib.sha256(json.dumps([[v.name, v.options] for v in variants]).encode()).hexdigest()[:10]
+    plan = variants[0].plan
+    folder = out / "programs" / f"{plan.task}_{plan.config.method}_{digest}"
+    return Program(folder=folder, variants=tuple(variants))
+
+
+def write_program(program: Program) -> None:
+    """Makes the folders of a program and of its runs, and leaves program.json for its worker."""
+    program.folder.mkdir(parents=True, exist_ok=True)
+    for variant in program.variants:
+        variant.plan.folder.mkdir(parents=True, exist_ok=True)
+    content = {"variants": [{"name": v.name, "options": v.options} for v in program.variants]}
+    run_folder.write_json(program.folder / "program.json", content)
+
+
+def read_program(folder: Path) -> Program:
+    """The program that `write_program` left. Raises `UsageError` if it is missing or damaged."""
+    content = run_folder.read_json(folder / "program.json")
+    out = folder.parent.parent
+    try:
+        pairs = [(v["name"], v["options"]) for v in content["variants"]]
+    except (KeyError, TypeError):
+        raise UsageError(f"{folder}/program.json: damaged; repeat the sweep in another folder") from None
+    load = functools.cache(load_demonstrations)
+    return Program(folder=folder, variants=tuple(_variant(name, given, out, load) for name, given in pairs))

@@ -1,0 +1,51 @@
+"""Carries out one program of a sweep: trains all its variants together and completes their run folders.
+
+`sweep` and `ablations` start it. A program that was interrupted goes on from its last checkpoint.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.cli import command_line, interruption
+from experiments.cli.command_line import Parser
+from experiments.runs.execution import execute_together
+from experiments.sweeps import variants
+
+
+def make_parser() -> Parser:
+    """The options of this launcher."""
+    parser = Parser("sweeps.worker", __doc__ or "")
+    parser.add_argument("program", type=Path, metavar="PROGRAM_DIR", help="a folder under `programs` of a sweep")
+    parser.add_argument("--cpus", type=_cpus, metavar="I,J,...", help="run on these CPUs alone")
+    parser.add_argument("--until-eof", action="store_true", help="stop when standard input ends: whoever waits is gone")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Trains, evaluates, writes the run folders."""
+    if arguments.until_eof:
+        interruption.stop_at_eof()
+    if arguments.cpus and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, arguments.cpus)
+    program = variants.read_program(arguments.program)
+    finished = {variant.plan.folder for variant in program.variants if variant.finished}
+    if len(finished) == len(program.variants):
+        return  # a worker before this one died when everything was done
+    plans = [variant.plan for variant in program.variants]
+    execute_together(plans, program.folder / "checkpoints", resume=True, finished=finished)
+
+
+def _cpus(text: str) -> list[int]:
+    return [command_line.natural(part) for part in text.split(",")]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
+    return command_line.run_launcher(make_parser(), run, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

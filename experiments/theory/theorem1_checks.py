@@ -1,0 +1,269 @@
+"""The claims of Theorem 1, each computed exactly and set beside what is allowed."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from experiments.theory import tabular
+from experiments.theory.tabular import Array, Process, Solution
+
+BETA = 0.1  # without entropy the learner just matches the expert, cost and all: nothing would be tested
+BOUNDS = np.geomspace(1e-2, 1e2, 41)  # L, of the multiplier
+BETAS = np.geomspace(1e-4, 1e-2, 9)
+NUM_ROUNDS = 6000
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """One claim: `measured` must be at most `tolerance`."""
+
+    claim: str
+    measured: float
+    tolerance: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the claim holds; a NaN does not."""
+        return bool(self.measured <= self.tolerance)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A process with a cheap and a costly expert, and the learners of both."""
+
+    process: Process
+    cheap: Array
+    costly: Array
+    bound_by_cheap: Solution
+    bound_by_costly: Solution
+    random: np.random.Generator
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """An iterative method on the cheap expert, after each round."""
+
+    cost: Array  # [rounds] J
+    multiplier: Array  # [rounds] lambda, or of CVAG the one that its share of reward steps amounts to
+    distance: Array  # [rounds] largest difference of an occupancy from the solution's
+
+
+def make_problem(seed: int) -> Problem:
+    """Draws processes until one expert's cost binds its learner and the other's does not.
+
+    Both experts maximise a random reward and some entropy; the one avoids cost, the other seeks it.
+    """
+    random = np.random.default_rng(seed)
+    while True:
+        process = tabular.random_process(random)
+        reward = random.uniform(size=process.cost.shape)
+        cheap, costly = (
+            process.occupancy(tabular.soft_optimum(process, reward + liking * process.cost, 0.2)[0])
+            for liking in (-1.0, 4.0)
+        )
+        learners = [tabular.saddle(process, expert, BETA) for expert in (cheap, costly)]
+        slack = process.episode_cost(costly) - process.episode_cost(learners[1].rho)
+        if learners[0].multiplier > 0.05 and slack > 1e-3:
+            return Problem(
+                process=process,
+                cheap=cheap,
+                costly=costly,
+                bound_by_cheap=learners[0],
+                bound_by_costly=learners[1],
+                random=random,
+            )
+
+
+def random_occupancies(problem: Problem, number: int) -> Iterator[Array]:
+    """Occupancies of random policies."""
+    shape = problem.cheap.shape
+    for _ in range(number):
+        yield problem.process.occupancy(problem.random.dirichlet(np.ones(shape[1]), shape[0]))
+
+
+def check_discriminator(problem: Problem) -> list[Check]:
+    """Equation 2, maximised entry by entry without calculus: golden sections, for 20 random learners."""
+    from scipy.optimize import minimize_scalar
+
+    value_error = argument_error = 0.0
+    for rho in random_occupancies(problem, 20):
+        found = np.empty_like(rho)
+        for index, (learner, expert) in enumerate(zip(rho.ravel(), problem.cheap.ravel(), strict=True)):
+            result = minimize_scalar(
+                lambda d, learner=learner, expert=expert: -learner * np.log(d) - expert * np.log1p(-d),
+                bounds=(1e-12, 1 - 1e-12),
+                method="bounded",
+                options={"xatol": 1e-12},
+            )
+            found.flat[index] = result.x
+        value = np.sum(rho * np.log(found)) + np.sum(problem.cheap * np.log1p(-found))
+        value_error = max(value_error, abs(value - tabular.divergence(rho, problem.cheap)))
+        argument_error = max(
+            argument_error, float(np.max(np.abs(found - tabular.best_discriminator(rho, problem.cheap))))
+        )
+    return [
+        Check("max over D of the objective = 2 JS - log 4, 20 learners: largest error", value_error, 1e-10),
+        Check("its maximiser D* = rho / (rho + rho_E): largest error", argument_error, 1e-5),
+    ]
+
+
+def bounded_learners(problem: Problem) -> list[Solution]:
+    """The cheap expert's learners for each bound L of the multiplier."""
+    return [tabular.saddle(problem.process, problem.cheap, BETA, bound) for bound in BOUNDS]
+
+
+def check_bounded_multiplier(problem: Problem, learners: Sequence[Solution]) -> list[Check]:
+    """psi* with lambda in [0, L] is 2 JS - log 4 + L [J - J_E]_+: an exact penalty from L = lambda* on."""
+    process, solution = problem.process, problem.bound_by_cheap
+    expert_cost = process.episode_cost(problem.cheap)
+    worst = 0.0
+    for learner, bound in zip(learners, BOUNDS, strict=True):
+        penalised = tabular.divergence(learner.rho, problem.cheap) - BETA * tabular.entropy(learner.rho)
+        penalised += bound * max(0.0, process.episode_cost(learner.rho) - expert_cost)
+        for rho in random_occupancies(problem, 20):  # it is the penalised problem's minimum
+            other = tabular.divergence(rho, problem.cheap) - BETA * tabular.entropy(rho)
+            worst = max(worst, penalised - other - bound * max(0.0, process.episode_cost(rho) - expert_cost))
+        worst = max(worst, abs(penalised - learner.value))
+    large = [x.rho for x, bound in zip(learners, BOUNDS, strict=True) if bound > solution.multiplier]
+    small = [x for x, bound in zip(learners, BOUNDS, strict=True) if bound < 0.99 * solution.multiplier]
+    least_excess = min(process.episode_cost(x.rho) - expert_cost for x in small)
+    return [
+        Check("lambda in [0, L] adds L [J - J_E]_+, 41 bounds: largest error of the minimum", worst, 1e-9),
+        Check(
+            "L above lambda* changes nothing: largest difference of occupancy",
+            max(float(np.max(np.abs(rho - solution.rho))) for rho in large),
+            1e-9,
+        ),
+        Check("L below lambda* is too little: cost left above J_E, negated", -least_excess, -1e-6),
+    ]
+
+
+def check_minimax(problem: Problem) -> list[Check]:
+    """min max = max min: soft value iteration, which knows no convexity, gives D* and lambda* the same value."""
+    checks = []
+    for name, expert, solution in (
+        ("cheap", problem.cheap, problem.bound_by_cheap),
+        ("costly", problem.costly, problem.bound_by_costly),
+    ):
+        best = tabular.best_discriminator(solution.rho, expert)
+        dual = tabular.dual_value(problem.process, expert, BETA, best, solution.multiplier)
+        checks.append(
+            Check(f"min max = max min, {name} expert: duality gap at (D*, lambda*)", abs(solution.value - dual), 1e-9)
+        )
+        reward = -np.log(best) - solution.multiplier * problem.process.cost
+        policy, _ = tabular.soft_optimum(problem.process, reward, BETA)
+        difference = np.max(np.abs(policy - tabular.policy_of(solution.rho)))
+        checks.append(Check(f"RL on what IRL found is the learner, {name} expert (proposition 3)", difference, 1e-8))
+        others = (
+            tabular.dual_value(
+                problem.process,
+                expert,
+                BETA,
+                problem.random.uniform(0.05, 0.95, expert.shape),
+                problem.random.uniform(0, 5),
+            )
+            for _ in range(50)
+        )
+        above = max(others) - solution.value
+        checks.append(Check(f"50 other (D, lambda) guarantee less, {name} expert: most, less the value", above, 0.0))
+    return checks
+
+
+def check_slackness(problem: Problem) -> list[Check]:
+    """lambda* (J - J_E) = 0: the multiplier is positive only where the cost meets the expert's."""
+    excess = {
+        name: problem.process.episode_cost(solution.rho) - problem.process.episode_cost(expert)
+        for name, expert, solution in (
+            ("cheap", problem.cheap, problem.bound_by_cheap),
+            ("costly", problem.costly, problem.bound_by_costly),
+        )
+    }
+    return [
+        Check("cheap expert: |J - J_E| at the solution", abs(excess["cheap"]), 1e-9),
+        Check("cheap expert: -lambda* (must be negative)", -problem.bound_by_cheap.multiplier, -0.01),
+        Check("costly expert: lambda*", problem.bound_by_costly.multiplier, 0.0),
+        Check("costly expert: J - J_E (must be negative)", excess["costly"], -0.001),
+    ]
+
+
+def distances(problem: Problem) -> Array:
+    """Of the learner from the cheap expert, largest difference of occupancy, for each of `BETAS`."""
+    learners = (tabular.saddle(problem.process, problem.cheap, beta) for beta in BETAS)
+    return np.array([np.max(np.abs(x.rho - problem.cheap)) for x in learners])
+
+
+def check_small_entropy(found: Array) -> list[Check]:
+    """beta -> 0 recovers the expert, linearly."""
+    slope = np.polyfit(np.log(BETAS), np.log(found), 1)[0]
+    return [
+        Check("beta -> 0 recovers the expert: distance at beta = 1e-4", float(found[0]), 1e-2),
+        Check("linearly in beta: |slope - 1| in log-log scale", abs(float(slope) - 1), 0.05),
+    ]
+
+
+def imitation_reward(problem: Problem, policy: Array) -> tuple[Array, Array]:
+    """The policy's occupancy, and -log D* less beta log pi: the slope of its entropy is part of the reward."""
+    rho = problem.process.occupancy(policy)
+    return rho, -np.log(tabular.best_discriminator(rho, problem.cheap)) - BETA * np.log(policy)
+
+
+def run_ccil(problem: Problem, size: float = 0.2, rate: float = 0.5) -> Run:
+    """CCIL: a natural step on reward less lambda times cost, then dual ascent on the gap."""
+    process, expert_cost = problem.process, problem.process.episode_cost(problem.cheap)
+    policy, multiplier, rows = np.full(problem.cheap.shape, 1 / problem.cheap.shape[1]), 0.0, []
+    for _ in range(NUM_ROUNDS):
+        rho, reward = imitation_reward(problem, policy)
+        cost = process.episode_cost(rho)
+        rows.append((cost, multiplier, np.max(np.abs(rho - problem.bound_by_cheap.rho))))
+        policy = tabular.natural_step(process, policy, reward - multiplier * process.cost, size)
+        multiplier = max(0.0, multiplier + rate * (cost - expert_cost))
+    costs, multipliers, away = np.array(rows).T
+    return Run(cost=costs, multiplier=multipliers, distance=away)
+
+
+def run_cvag(problem: Problem, size: float = 0.01) -> tuple[Run, Solution]:
+    """CVAG: a step on the reward while J is at most J_E, else on less cost; both with entropy, as printed.
+
+    The second value is what it should settle at. With a share a of reward steps the mean step is a (reward) - (1 - a)
+    (cost) + beta (entropy), so lambda = (1 - a) / a, and the entropy weighs beta / a.
+    """
+    process, expert_cost = problem.process, problem.process.episode_cost(problem.cheap)
+    policy, rows = np.full(problem.cheap.shape, 1 / problem.cheap.shape[1]), []
+    for _ in range(NUM_ROUNDS):
+        rho, reward = imitation_reward(problem, policy)
+        cost = process.episode_cost(rho)
+        within = cost <= expert_cost
+        rows.append((cost, within, rho))
+        policy = tabular.natural_step(
+            process, policy, reward if within else -process.cost - BETA * np.log(policy), size
+        )
+    rewarded = np.array([row[1] for row in rows], float)
+    share = np.cumsum(rewarded[NUM_ROUNDS // 2 :]) / np.arange(1, NUM_ROUNDS - NUM_ROUNDS // 2 + 1)
+    settled = tabular.saddle(process, problem.cheap, BETA / share[-1])
+    window = 200
+    recent = np.convolve(rewarded, np.ones(window) / window, mode="valid")
+    recent = np.concatenate([np.full(window - 1, np.nan), recent])
+    with np.errstate(divide="ignore"):
+        multiplier = (1 - recent) / recent
+    multiplier[-1] = (1 - share[-1]) / share[-1]
+    away = np.array([np.max(np.abs(row[2] - settled.rho)) for row in rows])
+    return Run(cost=np.array([row[0] for row in rows]), multiplier=multiplier, distance=away), settled
+
+
+def check_methods(problem: Problem, ccil: Run, cvag: Run, settled: Solution) -> list[Check]:
+    """CCIL converges to the saddle point, CVAG slides along J = J_E."""
+    expert_cost, half = problem.process.episode_cost(problem.cheap), NUM_ROUNDS // 2
+    error = abs(ccil.multiplier[-1] - problem.bound_by_cheap.multiplier)
+    sliding = float(np.mean(cvag.cost[half:])) - expert_cost
+    return [
+        Check("CCIL ends at the saddle: largest difference of occupancy", float(ccil.distance[-1]), 1e-6),
+        Check("CCIL's multiplier ends at lambda*", float(error), 1e-5),
+        Check("CVAG slides along J = J_E: |mean J - J_E|, second half", abs(sliding), 2e-3),
+        Check(
+            "its share a of reward steps: |(1 - a) / a - lambda*|, relative",
+            abs(float(cvag.multiplier[-1]) / settled.multiplier - 1),
+            0.05,
+        ),
+        Check("and it stays near that saddle: occupancy, second half", float(np.max(cvag.distance[half:])), 1e-2),
+    ]
