@@ -20,8 +20,8 @@ from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, wa
 
 IN_A_PROCESS = """
 import hashlib, json, jax, numpy
-from ccil_jax import runner
-from envs.base import numbers
+from ccil_jax.training import runner
+from envs.jax_tools import numbers
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
 with quick_compilation():

@@ -114,7 +114,7 @@ def test_a_limit_on_file_sizes_is_not_a_damaged_file(path: Path, monkeypatch: py
 
 def test_memory_and_time_are_limited() -> None:
     code = (
-        "import resource, numpy as np; from ccil_jax import hdf5_child\n"
+        "import resource, numpy as np; from ccil_jax.demonstrations import hdf5_child\n"
         "hdf5_child.CPU_SECONDS = 1\n"
         "hdf5_child.limit_resources(1024)\n"
         "try: np.ones(2**28)\n"

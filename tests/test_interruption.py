@@ -61,7 +61,7 @@ def test_no_signal_no_effect() -> None:
 IGNORANT = """
 import os, signal, sys, time
 sys.path.insert(0, {root!r})
-from experiments import interruption
+from experiments.cli import interruption
 for number in interruption.SIGNALS:
     signal.signal(number, signal.SIG_IGN if number in {ignored} else signal.SIG_DFL)
 with interruption.Interruption() as run:

@@ -94,7 +94,7 @@ def test_devices_share_runs_evenly(num_runs: int, num_cores: int, expected: int)
 @pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="Linux only")
 def test_the_threads_of_a_training_are_scheduled_as_a_batch_job() -> None:
     script = (
-        "import os; from experiments import devices; devices.spread_seeds(2);"
+        "import os; from experiments.cli import xla; xla.spread_seeds(2);"
         "import jax; before = set(os.listdir('/proc/self/task')); jax.numpy.ones(3).block_until_ready();"
         "started = set(os.listdir('/proc/self/task')) - before; assert started;"
         "print({os.sched_getscheduler(int(thread)) for thread in started} == {os.SCHED_BATCH})"
@@ -161,7 +161,8 @@ def test_fields_that_agree_stay_numbers() -> None:
 
 ON_FOUR_DEVICES = """
 import json, sys, jax
-from ccil_jax import evaluation, runner
+from ccil_jax.acting import evaluation
+from ccil_jax.training import runner
 from ccil_jax.training.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 

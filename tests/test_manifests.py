@@ -279,7 +279,7 @@ def test_two_writers_are_refused_and_a_killed_one_is_not(tmp_path: Path) -> None
     path = tmp_path / "run.lock"
     code = (
         f"import sys, pathlib; sys.path.insert(0, {str(Path(__file__).parent.parent)!r})\n"
-        "from ccil_jax import files\n"
+        "from ccil_jax.training import filesystem\n"
         f"with filesystem.hold(pathlib.Path({str(path)!r})): print('held', flush=True); sys.stdin.read()"
     )
     command = [sys.executable, "-c", code]
