@@ -10,6 +10,7 @@ import numbers
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+from ccil_jax.errors import ConfigError
 from ccil_jax.methods import METHODS, Method
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
@@ -25,10 +26,6 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "value_loss": ("value", "v0"),
 }
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot run. The message names the option and the remedy."""
 
 
 class Use(NamedTuple):

@@ -127,9 +127,8 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
     chosen = [(name, answer) for name in names for answer in QUESTIONS[name].answers]
     configs = {key: _config(fields, QUESTIONS[key[0]].answers[key[1]], QUESTIONS[key[0]].method) for key in chosen}
     idle = {key: set(unused(config)) for key, config in configs.items()}
-    with options.errors_name_options():
-        in_vain = {name: shared[name] for name in shared if all(name in unused_here for unused_here in idle.values())}
-        check_used(configs[chosen[0]].replace(**in_vain), in_vain)
+    in_vain = {name: shared[name] for name in shared if all(name in unused_here for unused_here in idle.values())}
+    check_used(configs[chosen[0]].replace(**in_vain), in_vain)
     load = functools.cache(load_demonstrations)
     for name, answer in chosen:
         question = QUESTIONS[name]

@@ -28,8 +28,8 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import ConfigError
-from ccil_jax.demonstrations.trajectories import DemonstrationsError, load_demonstrations
+from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.errors import UserError
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
 from experiments.sweeps import comparison, dispatch
@@ -125,8 +125,8 @@ def variants_of(path: Path, spec: Mapping[str, Any], out: Path) -> dict[str, tup
         name = name if len(name) <= _LONGEST_NAME else f"variant_{i}"
         try:
             variant = make_variant(name, {**common, **point}, out, load=load)
-        except (UsageError, ConfigError, DemonstrationsError) as error:
-            raise UsageError(f"SPEC {path}: {error}") from None
+        except UserError as error:
+            raise UsageError(f"SPEC {path}: {error.on_command_line()}") from None
         if name in found:
             raise UsageError(f"SPEC {path}: grid: two points would share the folder {name}; rename what differs")
         if (run := run_of(variant)) in names:

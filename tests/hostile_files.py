@@ -28,7 +28,8 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.demonstrations import hdf5, hdf5_child, npz
-from ccil_jax.demonstrations.trajectories import DemonstrationsError, load_demonstrations
+from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.errors import DemonstrationsError
 from experiments import convert
 from tests import hostile_builders
 from tests.hostile_builders import CANARY, FAMILIES, LIMIT, SOUND

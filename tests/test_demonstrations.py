@@ -12,12 +12,12 @@ import pytest
 
 from ccil_jax.demonstrations.trajectories import (
     Demonstrations,
-    DemonstrationsError,
     check_matches,
     check_time_limit,
     load_demonstrations,
     save_demonstrations,
 )
+from ccil_jax.errors import DemonstrationsError
 from experiments import train
 from experiments.runs.execution import Plan
 

@@ -14,12 +14,8 @@ import numpy as np
 import pytest
 
 from ccil_jax.demonstrations import hdf5, hdf5_child
-from ccil_jax.demonstrations.trajectories import (
-    Demonstrations,
-    DemonstrationsError,
-    load_demonstrations,
-    save_demonstrations,
-)
+from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations, save_demonstrations
+from ccil_jax.errors import DemonstrationsError
 from experiments import convert
 
 LENGTHS = (3, 4, 2)

@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 
 from ccil_jax.config import Config
+from ccil_jax.errors import CheckpointError, LockedError
 from ccil_jax.training import checkpointing, filesystem, manifests
 from ccil_jax.training.checkpointing import Checkpointer
-from ccil_jax.training.filesystem import LockedError
-from ccil_jax.training.manifests import CheckpointError, Identity
+from ccil_jax.training.manifests import Identity
 from tests.probe_envs import same_bits
 
 CONFIG = Config(method="lgail", cost_limit=1.0)

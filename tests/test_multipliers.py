@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from ccil_jax.config import Config, ConfigError, validate
+from ccil_jax.config import Config, validate
+from ccil_jax.errors import ConfigError
 from ccil_jax.learning import constraints, multipliers
 from ccil_jax.learning.multipliers import Gains, Pid
 

@@ -15,7 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ccil_jax.demonstrations import npz
-from ccil_jax.demonstrations.trajectories import DemonstrationsError, load_demonstrations
+from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.errors import DemonstrationsError
 
 ARRAYS = {"x": np.arange(12.0).reshape(3, 4), "flags": np.array([True, False]), "text": np.array("{}")}
 

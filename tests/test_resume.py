@@ -10,10 +10,9 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax.config import ConfigError
 from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.errors import CheckpointError, ConfigError
 from ccil_jax.training import runner
-from ccil_jax.training.manifests import CheckpointError
 from ccil_jax.training.runner import Result
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 

@@ -16,7 +16,8 @@ import pytest
 
 import envs
 from ccil_jax.agents import build
-from ccil_jax.config import Config, ConfigError
+from ccil_jax.config import Config
+from ccil_jax.errors import ConfigError
 from ccil_jax.training import runner
 from ccil_jax.training.history import EPISODE_ESTIMATES, without_unknown
 from ccil_jax.training.program import compile_program

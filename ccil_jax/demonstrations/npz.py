@@ -19,6 +19,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from ccil_jax.errors import UserError
+
 MAX_BYTES = 2 * 1024**3  # of all arrays together, unpacked: a small archive can unpack to terabytes
 
 _CHUNK = 1024**2
@@ -42,7 +44,7 @@ _DAMAGE = (  # what a hostile archive can raise out of zipfile, zlib, struct, as
 )
 
 
-class ArchiveError(ValueError):
+class ArchiveError(UserError):
     """An archive that cannot be read. The message is one line: file, key, remedy."""
 
 

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ccil_jax.demonstrations import columns, formats, npz
+from ccil_jax.errors import DemonstrationsError
 
 _FORMS: Mapping[str, Callable[[np.ndarray, str], np.ndarray]] = {
     "obs": columns.rows,
@@ -29,10 +30,6 @@ _FORMS: Mapping[str, Callable[[np.ndarray, str], np.ndarray]] = {
 _NUMBER_KEYS = ("obs", "actions", "rewards", "costs")
 _STEP_KEYS = (*_NUMBER_KEYS, "terminated", "truncated")
 _REWRITE = "write the file with ccil_jax.save_demonstrations"
-
-
-class DemonstrationsError(ValueError):
-    """Demonstrations that cannot be used. The message is one line: file, key, row, remedy."""
 
 
 class TaskInfo(Protocol):

@@ -18,9 +18,10 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from ccil_jax.errors import CheckpointError
 from ccil_jax.training import manifests
 from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
-from ccil_jax.training.manifests import CheckpointError, DamageError, Identity
+from ccil_jax.training.manifests import DamageError, Identity
 from ccil_jax.types import PyTree
 from envs.jax_tools import numbers
 

@@ -9,7 +9,7 @@ import platform
 from collections.abc import Iterator
 from pathlib import Path
 
-from ccil_jax.config import ConfigError
+from ccil_jax.errors import LockedError
 
 DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # or a quota, or the largest file that may be
 
@@ -22,10 +22,6 @@ def unfit_for_checkpoints(path: Path) -> str | None:
     if "[" not in str(path.resolve()):
         return None
     return "checkpoints cannot be kept below a folder with [ in its name; choose another"
-
-
-class LockedError(ConfigError):
-    """A folder that another process writes to. The message names both."""
 
 
 @contextlib.contextmanager

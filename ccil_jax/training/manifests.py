@@ -15,8 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from ccil_jax.config import Config, ConfigError, unused
+from ccil_jax.config import Config, unused
 from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.errors import CheckpointError
 from ccil_jax.training.filesystem import file_sha256
 from ccil_jax.training.versions import versions
 from ccil_jax.types import PyTree
@@ -24,10 +25,6 @@ from envs.base import Environment
 from envs.jax_tools import numbers
 
 NAME = "manifest.json"
-
-
-class CheckpointError(ConfigError):
-    """A checkpoint that cannot be written or trusted. The message names the file or array, and the remedy."""
 
 
 class DamageError(CheckpointError):

@@ -13,13 +13,14 @@ import numpy as np
 
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents import iq_learn
-from ccil_jax.config import Config, ConfigError, field_names, is_integer, validate, with_limit_of
+from ccil_jax.config import Config, field_names, is_integer, validate, with_limit_of
 from ccil_jax.demonstrations.trajectories import Demonstrations, check_time_limit
+from ccil_jax.errors import CheckpointError, ConfigError
 from ccil_jax.training import filesystem, guard
 from ccil_jax.training.checkpointing import Checkpointer
 from ccil_jax.training.guard import GuardedState
 from ccil_jax.training.history import without_unknown
-from ccil_jax.training.manifests import CheckpointError, Identity, identity_of
+from ccil_jax.training.manifests import Identity, identity_of
 from ccil_jax.training.program import Program, compile_program, make_agent
 from ccil_jax.types import ExpertData, ExpertTransitions
 from envs.base import Environment

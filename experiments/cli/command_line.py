@@ -15,8 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ccil_jax.config import ConfigError
-from ccil_jax.demonstrations.trajectories import DemonstrationsError
+from ccil_jax.errors import UserError
 from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
 from experiments.cli import xla
 
@@ -24,7 +23,7 @@ CONSOLE = "ccil"  # the command that an installation brings along; `experiments.
 MAX_ERROR = 1000  # characters of an error message, which may quote a file
 
 
-class UsageError(ValueError):
+class UsageError(UserError):
     """Wrong input. The message is one line that names the option or file and the remedy."""
 
 
@@ -77,8 +76,8 @@ def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None]
     xla.keep_programs()
     try:
         return run(arguments) or 0
-    except (UsageError, ConfigError, DemonstrationsError) as error:
-        parser.error(str(error))
+    except UserError as error:
+        parser.error(error.on_command_line())
     except OSError as error:
         if error.errno not in DISK_IS_FULL:
             raise

@@ -1,15 +1,14 @@
 """Options that training launchers share: the `Config` fields, and what a run is besides its hyperparameters."""
 
 import argparse
-import contextlib
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from ccil_jax.config import CHOICES, PRESETS, Config, ConfigError, Use, validate
+from ccil_jax.config import CHOICES, PRESETS, Config, Use, validate
 from ccil_jax.methods import METHODS
 from envs import registry
 from envs.registry import PHYSICS, TASKS, TaskInfo
@@ -100,19 +99,9 @@ def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] 
         ConfigError: also for an option given that makes no difference to the run.
     """
     base, changes = ({k: v for k, v in fields.items() if k in CONFIG_FIELDS} for fields in (saved, given))
-    with errors_name_options():
-        config = Config.from_base({**PRESETS[preset], **base}, changes)
-        validate(config)
+    config = Config.from_base({**PRESETS[preset], **base}, changes)
+    validate(config)
     return config
-
-
-@contextlib.contextmanager
-def errors_name_options() -> Iterator[None]:
-    """Has a `ConfigError` speak of options as they are typed, `--max-kl`, and not of fields, `--max_kl`."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(_with_hyphens(str(error))) from None
 
 
 def find_task(name: str | None, option: str = "--env") -> TaskInfo:
@@ -134,12 +123,6 @@ def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
     for name in given.keys() - task.options.keys():
         raise UsageError(f"--{name.replace('_', '-')}: {task.name} has no such option; leave it out")
     return {**task.options, **given, "max_episode_steps": choices["max_episode_steps"]}
-
-
-def _with_hyphens(message: str) -> str:
-    for name in CONFIG_FIELDS:
-        message = message.replace(f"--{name}", "--" + name.replace("_", "-"))
-    return message
 
 
 def _parser_of(annotation: Any) -> Callable[[str], Any]:

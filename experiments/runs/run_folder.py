@@ -16,7 +16,8 @@ from typing import Any, Self, TextIO
 
 import numpy as np
 
-from ccil_jax.config import Config, ConfigError, check_types
+from ccil_jax.config import Config, check_types
+from ccil_jax.errors import ConfigError
 from ccil_jax.training.history import without_unknown
 from ccil_jax.training.versions import versions
 from envs.registry import TASKS
