@@ -21,7 +21,7 @@ from ccil_jax.training.checkpointing import Checkpointer
 from ccil_jax.training.guard import GuardedState
 from ccil_jax.training.history import without_unknown
 from ccil_jax.training.manifests import Identity, identity_of
-from ccil_jax.training.program import Program, compile_program, make_agent
+from ccil_jax.training.program import Program, compile_program, guarded_agent
 from ccil_jax.types import ExpertData, ExpertTransitions
 from envs.base import Environment
 
@@ -385,7 +385,7 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     )
 
     def init(key: jax.Array) -> GuardedState:
-        return jax.vmap(make_agent(config, env, steps).init)(jax.random.split(key, num_seeds))
+        return jax.vmap(guarded_agent(config, env, steps).init)(jax.random.split(key, num_seeds))
 
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     like = jax.tree.map(
