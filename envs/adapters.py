@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from envs.base import State, check_shape, compute_where, executed, first_state, next_state
-from envs.registry import check_count
+from envs.options import check_count
 
 BraxState = Any
 # Wrappers, by parts of their classes' names, after which a step no longer says how the episode goes on.
