@@ -13,9 +13,10 @@ from jax.extend.core import Jaxpr, Literal
 from jax.interpreters import partial_eval
 
 from ccil_jax.agents import build
-from ccil_jax.config import PRESETS, Config, field_names, unused, validate, with_limit_of
+from ccil_jax.config import Config, field_names, unused, validate, with_limit_of
 from ccil_jax.errors import ConfigError
 from ccil_jax.methods import METHODS
+from ccil_jax.presets import PRESETS
 from ccil_jax.training import runner
 from experiments import ablations, expert, sweep, train
 from experiments.cli.command_line import UsageError
@@ -233,7 +234,7 @@ def test_ablations_give_what_is_shared_to_those_who_use_it_and_refuse_what_nobod
     assert answers["meta_gradient", "none"].plan.config == Config.from_preset(
         "paper", method="malm", meta_gradient="none"
     ).replace(cost_limit=answers["gate", "batch"].plan.config.cost_limit)
-    with pytest.raises(ConfigError, match="^gate episode: makes no difference to this run of method malm"):
+    with pytest.raises(ConfigError, match=r"^gate episode: makes no difference to this run of method malm"):
         ablations.ask(["meta_gradient"], {**shared, "gate": "episode"}, tmp_path)
 
 

@@ -16,9 +16,10 @@ from mujoco.batch import Batch as RawBatch
 import envs
 from ccil_jax import meshes
 from ccil_jax.acting import networks, rollout, running_statistics
-from ccil_jax.config import PRESETS, Config
+from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.learning import constraints, policy_step
+from ccil_jax.presets import PRESETS
 from ccil_jax.training import program, runner
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
