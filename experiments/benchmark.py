@@ -16,7 +16,9 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import CHOICES, PRESETS, Config
+from ccil_jax.config import Config
+from ccil_jax.methods import METHODS
+from ccil_jax.presets import PRESETS
 from ccil_jax.training.versions import versions
 from envs.registry import PHYSICS
 from experiments.cli import command_line, interruption, options, xla
@@ -45,7 +47,7 @@ def make_parser() -> Parser:
         metavar="N",
         help="per seed; one row for each (default: 16)",
     )
-    parser.add_argument("--method", default="malm", choices=CHOICES["method"], help="what is trained (default: malm)")
+    parser.add_argument("--method", default="malm", choices=tuple(METHODS), help="what is trained (default: malm)")
     parser.add_argument(
         "--physics", nargs="+", default=["auto"], choices=PHYSICS, help="engines; one row for each (default: auto)"
     )
