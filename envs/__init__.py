@@ -1,50 +1,72 @@
-"""Cost-constrained control tasks as pure functions. `make` builds one, `TASKS` lists them.
+"""Cost-constrained control tasks as pure functions. `make` builds one, `TASKS` lists them, `register` adds one.
 
-Importing this package imports neither JAX nor an engine (PEP 562): launchers answer `--help` at once.
+Importing this package imports neither JAX nor an engine nor gymnasium: launchers answer `--help` at once. Names that
+need them are imported when they are first used (PEP 562).
 """
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Never
 
-from envs.registry import PHYSICS, TASKS, TaskInfo, check_options, find_task
+from envs.registry import PHYSICS, TASKS, TaskInfo, find_task, register
 
 if TYPE_CHECKING:
     from envs.base import Environment, State
 
-__all__ = ["PHYSICS", "TASKS", "Environment", "State", "TaskInfo", "make"]
+__all__ = ["PHYSICS", "TASKS", "Environment", "State", "TaskInfo", "find_task", "make", "register"]
 
-_FAMILIES = {
-    "locomotion": ("envs.locomotion", "Locomotion"),
-    "safety_gym": ("envs.safety_gym.environment", "SafetyGym"),
-}
+_LAZY = {"Environment": "envs.base", "State": "envs.base"}
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
-def make(name: str, physics: str = "auto", **options: Any) -> "Environment":
-    """Builds a task.
+def make(
+    name: str,
+    physics: str = "auto",
+    *,
+    max_episode_steps: int | None = None,
+    num_threads: int | None = None,
+    cost_threshold: float | None = None,
+    contact_cost: bool | None = None,
+    options: Mapping[str, Any] = _NOTHING,
+    **others: Never,
+) -> "Environment":
+    """Builds a task. An argument that is None is left to the task.
 
     Args:
-        name: a key of `TASKS`.
+        name: a key of `TASKS`; or "module:attribute", for example "my_package.tasks:make", a function or class that
+            returns an `Environment`. Its parameters, each with a default value, are the task's options.
         physics: "native" (C MuJoCo on threads), "mjx" (MJX-JAX), "warp" (MJX-Warp) or "auto": native where JAX runs
-            on a CPU, mjx on an accelerator.
-        **options: `max_episode_steps`, `num_threads`, and the task's own (`TaskInfo.options`).
+            on a CPU; on an accelerator warp, where it can run, else mjx.
+        max_episode_steps: control steps after which an episode is truncated.
+        num_threads: of the native engine. By default the usable CPUs are shared among JAX's local devices.
+        cost_threshold: locomotion tasks cost 1 in a step where their quantity exceeds it, else 0 (`TaskInfo.cost`).
+        contact_cost: whether contacts count in that quantity (Ant, Humanoid).
+        options: further options by name, as a registered task may have them (`TaskInfo.options`).
+        **others: at run time the same as `options`. For a type checker there are none, so that it reports a wrong
+            keyword as an error.
 
     Returns:
-        The environment: `reset(key)`, `step(state, action)`, single simulation, to be vmapped.
+        The environment: `reset(key)` and `step(state, action)` of a single simulation, to be vmapped.
 
     Raises:
-        ValueError: unknown task, physics or option, or a value that the option cannot have.
+        ValueError: the task, the physics or an option is unknown, has no effect, or cannot have the value given.
         ImportError: "warp" without the extra `mujoco-mjx[warp]`.
     """
-    task = find_task(name)
-    check_options(task, physics, options)
-    module, builder = _FAMILIES[task.family]
-    environment: Environment = getattr(importlib.import_module(module), builder)(name, physics=physics, **options)
+    usual = {
+        "max_episode_steps": max_episode_steps,
+        "num_threads": num_threads,
+        "cost_threshold": cost_threshold,
+        "contact_cost": contact_cost,
+    }
+    given = {key: value for key, value in usual.items() if value is not None}
+    if twice := [key for key in options if key in given or key in others]:
+        raise ValueError(f"{name}: option {twice[0]!r} is given twice; give it by keyword or in `options`")
+    environment: Environment = find_task(name).make(physics, {**given, **options, **others})
     return environment
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("Environment", "State"):
-        import envs.base
-
-        return getattr(envs.base, name)
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
     raise AttributeError(f"module 'envs' has no attribute {name!r}")

@@ -18,7 +18,7 @@ from gymnasium.vector.utils import batch_space
 
 from envs.base import State, check_shape, executed, first_state, next_state
 from envs.jax_tools import compute_where
-from envs.registry import check_count
+from envs.options import check_count
 
 BraxState = Any
 # Wrappers, by parts of their classes' names, after which a step no longer says how the episode goes on.

@@ -10,72 +10,98 @@ Where they depart from `-v5`, on purpose:
 
 import importlib.util
 import pathlib
+from collections.abc import Iterable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
 from envs.base import State, check_shape, executed, first_state, next_state
-from envs.locomotion_tasks import TABLE, CostInputs
-from envs.registry import TASKS
+from envs.locomotion_tasks import TABLE, CostInputs, LocomotionTask
 
 
 class Locomotion:
-    """See `Environment`.
+    """A row of the table as an `Environment`.
 
-    `State.terms` has gymnasium's four reward terms ("forward", "healthy", "control", "contact", the last two <= 0),
-    all of them whether or not the task's reward sums them, so that they can be compared and plotted.
+    `State.terms` has the named terms of the row's own reward where it has one. Otherwise it has gymnasium's four
+    ("forward", "healthy", "control", "contact", the last two <= 0), whether or not the task's reward sums them, so
+    that they can be compared and plotted.
 
-    A simulation that turns non-finite terminates with reward and cost 0 and the offending observations at 0: MuJoCo
-    itself would put it back to its start unseen, and one NaN would spoil the learner's whole batch.
+    Where the physics yields NaN or infinity, the episode terminates with reward and cost 0, and the observations that
+    are not finite are shown as 0. MuJoCo itself would put the simulation back to its start and say nothing, and one
+    NaN would spoil the learner's whole batch.
 
     Args:
-        name: a key of `TASKS` of the locomotion family.
-        physics: backend; see `envs.make`.
-        cost_threshold: of the task's quantity; None takes the task's default.
-        contact_cost: whether the contact term counts in the cost (Ant, Humanoid). With the simulator of the
-            paper's authors it was zero; without it no contact forces are computed.
+        task: the row: one of `TABLE`, or a `LocomotionTask` of your own.
+        name: of the environment, for messages and records.
+        physics: engine; see `envs.make`.
+        cost_threshold: a step costs 1 where the row's quantity exceeds this, else 0.
+        contact_cost: whether the contact term counts in the cost. With the simulator of the paper's authors it was
+            zero. Without it no contact forces are computed.
         max_episode_steps: control steps until truncation.
-        num_threads: of the native backend; None shares the usable CPUs among the local devices.
+        num_threads: of the native engine; None shares the usable CPUs among JAX's local devices.
+
+    Raises:
+        ValueError: `contact_cost` is False and the row has no contact term; or see `envs.physics.make_physics`.
     """
 
     def __init__(
         self,
-        name: str,
+        task: LocomotionTask,
         *,
+        name: str,
+        cost_threshold: float,
         physics: str = "auto",
-        cost_threshold: float | None = None,
         contact_cost: bool = True,
         max_episode_steps: int = 1000,
         num_threads: int | None = None,
     ):
-        self.name = name
-        self.task = task = TABLE[name]
-        self.cost_threshold = TASKS[name].options["cost_threshold"] if cost_threshold is None else cost_threshold
+        if task.contact is None and not contact_cost:
+            raise ValueError(f"{name}: contact_cost False has no effect, its cost counts no contacts; leave it out")
+        self.name, self.task, self.cost_threshold = name, task, cost_threshold
         self.max_episode_steps = max_episode_steps
         self.model = model = load_model(task.xml)
         self.num_substeps = task.frame_skip
         self.dt = float(model.opt.timestep) * self.num_substeps
-        self.obs_dim, self.action_dim = TASKS[name].obs_dim, TASKS[name].action_dim
+        self.action_dim = model.nu
         self.action_low, self.action_high = model.actuator_ctrlrange.astype("float32").T
         self._contact = task.contact if contact_cost else None
         fields = [field for field, _ in task.extra_obs] + ["cfrc_ext"] * (self._contact is not None)
+        fields = list(dict.fromkeys([*fields, *task.fields]))
+        track = [] if task.track is None else [task.track]
         self._physics = physics_lib.make_physics(
-            physics,
-            model,
-            num_substeps=self.num_substeps,
-            fields=fields,
-            track=[task.track],
-            num_threads=num_threads,
+            physics, model, num_substeps=self.num_substeps, fields=fields, track=track, num_threads=num_threads
         )
         self.physics_name = self._physics.name
+        (self.obs_dim,), self._term_names = self._forms(fields, track)
+
+    def _forms(self, fields: list[str], track: list[str]) -> tuple[tuple[int, ...], list[str]]:
+        """The shape of an observation and the names of the reward's terms. Nothing is computed, not even physics."""
+        template, dtype = mujoco.MjData(self.model), jnp.result_type(float)
+
+        def abstract(name: str) -> Any:
+            return jax.ShapeDtypeStruct(np.shape(getattr(template, name)), dtype)
+
+        data = physics_lib.Data(
+            qpos=abstract("qpos"),
+            qvel=abstract("qvel"),
+            fields={name: abstract(name) for name in fields},
+            change={name: abstract(name) for name in track},
+            backend=(),
+        )
+        obs = jax.eval_shape(self._observe, data)
+        return obs.shape, list(jax.eval_shape(self._reward, data, abstract("ctrl"))[1])
 
     def reset(self, key: jax.Array) -> State:
-        """Starts an episode near the model's initial pose; `key` is consumed."""
-        qpos_key, qvel_key = jax.random.split(key)
+        """Starts an episode as the row says, usually near the model's initial pose; `key` is consumed."""
         model, task = self.model, self.task
+        if task.start is not None:
+            return self.reset_to(*task.start(model, key))
+        qpos_key, qvel_key = jax.random.split(key)
         noise = jax.random.uniform(qpos_key, (model.nq,), minval=-task.qpos_noise, maxval=task.qpos_noise)
         if task.qvel_normal:
             qvel = task.qvel_noise * jax.random.normal(qvel_key, (model.nv,))
@@ -88,17 +114,23 @@ class Locomotion:
         check_shape(f"{self.name}: qpos", qpos, (self.model.nq,))
         check_shape(f"{self.name}: qvel", qvel, (self.model.nv,))
         data = self._physics.init(qpos, qvel)
-        return first_state(data, self._observe(data), ("forward", "healthy", "control", "contact"))
+        return first_state(data, self._observe(data), self._term_names)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. See `Environment.step`."""
         action = executed(self, action)
         data = self._physics.step(state.physics, action)
         obs = self._observe(data)
-        velocity, terms = self._terms(data, action)
-        reward = sum((terms[name] for name in self.task.reward_terms), start=jnp.zeros_like(state.reward))
+        reward, terms = self._reward(data, action)
+        usual = self._usual_terms(data, action)
         quantity = self.task.cost_quantity(
-            CostInputs(velocity=velocity, control_cost=-terms["control"], contact_cost=-terms["contact"])
+            CostInputs(
+                velocity=self._velocity(data),
+                control_cost=-usual["control"],
+                contact_cost=-usual["contact"],
+                data=data,
+                action=action,
+            )
         )
         cost = (quantity > self.cost_threshold).astype(state.cost.dtype)
         finite = jnp.isfinite(obs).all() & jnp.isfinite(reward) & jnp.isfinite(quantity)
@@ -120,27 +152,47 @@ class Locomotion:
 
     def _healthy(self, data: physics_lib.Data) -> jax.Array:
         healthy = self.task.healthy
-        return jnp.ones((), bool) if healthy is None else healthy(data.qpos, data.qvel)
+        return jnp.ones((), bool) if healthy is None else healthy(self.model, data)
 
-    def _terms(self, data: physics_lib.Data, action: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """The root's velocity `[2]` in m/s and gymnasium's reward terms."""
-        task = self.task
-        velocity = task.displacement(self.model, data) / self.dt
+    def _velocity(self, data: physics_lib.Data) -> jax.Array:
+        """The root's velocity `[2]` in m/s."""
+        displacement = self.task.displacement
+        return jnp.zeros(2, data.qpos.dtype) if displacement is None else displacement(self.model, data) / self.dt
+
+    def _usual_terms(self, data: physics_lib.Data, action: jax.Array) -> dict[str, jax.Array]:
+        """Gymnasium's four reward terms."""
+        task, velocity = self.task, self._velocity(data)
         contact = jnp.zeros_like(velocity[0]) if self._contact is None else self._contact(data.fields["cfrc_ext"])
-        return velocity, {
+        return {
             "forward": task.forward_weight * velocity[0],
             "healthy": task.healthy_reward * self._healthy(data).astype(velocity.dtype),
             "control": -task.control_weight * jnp.square(action).sum().astype(velocity.dtype),
             "contact": -contact,
         }
 
+    def _reward(self, data: physics_lib.Data, action: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The reward `[]` and its named terms."""
+        if self.task.reward is not None:
+            terms = self.task.reward(self.model, data, action)
+            summed: Iterable[str] = terms
+        else:
+            terms, summed = self._usual_terms(data, action), self.task.reward_terms
+        return sum((terms[name] for name in summed), start=jnp.zeros((), data.qpos.dtype)), terms
+
     def _observe(self, data: physics_lib.Data) -> jax.Array:
-        """`[obs_dim]`: positions, velocities and the task's derived arrays."""
+        """`[obs_dim]`: the row's own, or positions, velocities and its derived arrays."""
         task, qvel = self.task, data.qvel
+        if task.observe is not None:
+            return task.observe(self.model, data)
         if task.velocity_clip is not None:
             qvel = jnp.clip(qvel, -task.velocity_clip, task.velocity_clip)
         extra = [data.fields[name][first:].ravel() for name, first in task.extra_obs]
         return jnp.concatenate([data.qpos[task.num_hidden :], qvel, *extra])
+
+
+def make(name: str, **options: Any) -> Locomotion:
+    """A built-in task: the row of `TABLE` under its name. For the options see `Locomotion`."""
+    return Locomotion(TABLE[name], name=name, **options)
 
 
 def load_model(xml: str) -> mujoco.MjModel:

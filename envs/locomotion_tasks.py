@@ -10,43 +10,59 @@ from flax import struct
 
 from envs.physics import Data
 
-Velocity = Callable[[mujoco.MjModel, Data], jax.Array]
-Healthy = Callable[[jax.Array, jax.Array], jax.Array]
-
 
 @struct.dataclass(kw_only=True)
 class CostInputs:
-    """What a cost may depend on."""
+    """What the quantity behind a task's cost may depend on."""
 
-    velocity: jax.Array  # [2] of the root in m/s
+    velocity: jax.Array  # [2] m/s, of the root during the control step
     control_cost: jax.Array  # [] the task's weight times the sum of squared actions
-    contact_cost: jax.Array  # [] zero where the contact term is switched off
+    contact_cost: jax.Array  # [] 0 where the contact term is switched off
+    data: Data | None = None  # the physics after the control step
+    action: jax.Array | None = None  # [action_dim] as executed
 
 
-Quantity = Callable[[CostInputs], jax.Array]
+OfData = Callable[[mujoco.MjModel, Data], jax.Array]
+Rewards = Callable[[mujoco.MjModel, Data, jax.Array], dict[str, jax.Array]]
+Start = Callable[[mujoco.MjModel, jax.Array], tuple[jax.Array, jax.Array]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LocomotionTask:
-    """One row of the table: the model, and what observation, reward, cost and termination are made of."""
+    """One row of the table: the model, and what observation, reward, cost, termination and start are made of.
 
-    xml: str  # file among gymnasium's own assets
-    frame_skip: int
-    num_hidden: int  # leading root coordinates left out of the observation
+    The usual observation is `qpos` without its first `num_hidden` entries, then `qvel`, then the arrays in `extra_obs`.
+    The usual reward is the sum of those of these terms that `reward_terms` names, with v the root's velocity along x
+    in m/s, a the action as executed and f the contact forces:
+
+        forward = forward_weight v      healthy = healthy_reward (0 where the robot is not healthy)
+        control = -control_weight |a|^2      contact = -contact(f)
+
+    A row may have an observation, a reward and a start of its own instead. Their functions are pure JAX, for a single
+    simulation; of `MjData` they may read what `fields` names, in `Data.fields`.
+    """
+
+    xml: str  # the model: a file among gymnasium's own assets, or an absolute path
+    frame_skip: int  # engine steps per control step
+    num_hidden: int = 0  # leading root coordinates left out of the observation
     velocity_clip: float | None = None  # of qvel in the observation
     extra_obs: tuple[tuple[str, int], ...] = ()  # derived arrays appended, each from this row on
-    track: str  # whose change gives the velocity
-    displacement: Velocity  # of the root over a control step, [2] in m
+    track: str | None = None  # the `MjData` array whose change gives the velocity; None: the velocity is 0
+    displacement: OfData | None = None  # [2] m, of the root over a control step, from `Data.change`
     forward_weight: float = 1.0
-    control_weight: float
+    control_weight: float = 0.0
     healthy_reward: float = 0.0
-    healthy: Healthy | None = None  # of (qpos, qvel); None: always, and the task never terminates
-    reward_terms: tuple[str, ...] = ("forward", "healthy")  # the authors' reward is the sum of these
-    contact: Callable[[jax.Array], jax.Array] | None = None  # contact cost of cfrc_ext
-    cost_quantity: Quantity  # the cost is 1 where it exceeds the threshold
-    qpos_noise: float  # uniform on +-
-    qvel_noise: float
-    qvel_normal: bool = False  # normal with sd `qvel_noise` instead of uniform
+    healthy: OfData | None = None  # [] bool; None: always healthy. An episode terminates where it is false
+    reward_terms: tuple[str, ...] = ("forward", "healthy")  # the paper authors' reward is the sum of these
+    contact: Callable[[jax.Array], jax.Array] | None = None  # [] contact cost, of cfrc_ext [nbody, 6]
+    cost_quantity: Callable[[CostInputs], jax.Array]  # []; the cost is 1 where it exceeds the threshold
+    qpos_noise: float = 0.0  # an episode starts at the model's qpos0 plus uniform noise of this half-width
+    qvel_noise: float = 0.0  # and with a velocity that is uniform noise of this half-width
+    qvel_normal: bool = False  # or, if this is set, normal noise of this standard deviation
+    fields: tuple[str, ...] = ()  # derived `MjData` arrays that this row's own functions read
+    observe: OfData | None = None  # [obs_dim], in place of the usual observation
+    reward: Rewards | None = None  # of (model, data, action): named terms, [] each, whose sum is the reward
+    start: Start | None = None  # of (model, key): qpos [nq] and qvel [nv] that an episode starts with
 
 
 def _first_coordinate(model: mujoco.MjModel, data: Data) -> jax.Array:
@@ -74,24 +90,27 @@ def _between(x: jax.Array, low: float, high: float) -> jax.Array:
     return (low < x) & (x < high)
 
 
-def _hopper_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+def _hopper_healthy(model: mujoco.MjModel, data: Data) -> jax.Array:
+    del model
+    qpos, qvel = data.qpos, data.qvel
     inside = _between(jnp.concatenate([qpos[2:], qvel]), -100.0, 100.0).all()
     return inside & (qpos[1] > 0.7) & _between(qpos[2], -0.2, 0.2)
 
 
-def _walker_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    del qvel
-    return _between(qpos[1], 0.8, 2.0) & _between(qpos[2], -1.0, 1.0)
+def _walker_healthy(model: mujoco.MjModel, data: Data) -> jax.Array:
+    del model
+    return _between(data.qpos[1], 0.8, 2.0) & _between(data.qpos[2], -1.0, 1.0)
 
 
-def _ant_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    finite = jnp.isfinite(qpos).all() & jnp.isfinite(qvel).all()
-    return finite & (qpos[2] >= 0.2) & (qpos[2] <= 1.0)
+def _ant_healthy(model: mujoco.MjModel, data: Data) -> jax.Array:
+    del model
+    finite = jnp.isfinite(data.qpos).all() & jnp.isfinite(data.qvel).all()
+    return finite & (data.qpos[2] >= 0.2) & (data.qpos[2] <= 1.0)
 
 
-def _humanoid_healthy(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
-    del qvel
-    return _between(qpos[2], 1.0, 2.0)
+def _humanoid_healthy(model: mujoco.MjModel, data: Data) -> jax.Array:
+    del model
+    return _between(data.qpos[2], 1.0, 2.0)
 
 
 TABLE = {

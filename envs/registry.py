@@ -1,14 +1,28 @@
-"""The table of tasks. Imports no JAX, no engine: launchers read it to answer `--help` and to reject wrong names."""
+"""The table of tasks: the built-in ones, those that `register` adds, and those that a text names.
+
+Imports neither JAX nor an engine: command lines read it to answer `--help` and to refuse wrong names at once.
+"""
 
 import dataclasses
-import difflib
-import math
-import operator
+import functools
+import inspect
+import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
-PHYSICS = ("auto", "native", "mjx", "warp")
+from envs.engines import AUTO, PHYSICS, check_physics
+from envs.lookup import hint, named_object, own_object
+from envs.options import CHECKS, COMMON
+
+__all__ = ["PHYSICS", "TASKS", "TaskInfo", "check_options", "find_task", "physics_name", "register"]
+
+_MAX_EPISODE_STEPS = 1000
+_MEMBERS = ("name", "obs_dim", "action_dim", "action_low", "action_high", "max_episode_steps", "reset", "step")
+
+
+def _nothing() -> Mapping[str, Any]:
+    return MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,29 +30,79 @@ class TaskInfo:
     """What is known of a task without building it."""
 
     name: str
-    family: str  # "locomotion" or "safety_gym": which class `envs.make` builds
-    obs_dim: int
-    action_dim: int
-    options: Mapping[str, Any]  # of `envs.make`, this family's own, with the task's defaults
-    cost_limit: float  # default episode cost allowed to the expert that records demonstrations
-    original: str  # the environment that the task is compared with, in gymnasium or safety-gymnasium
-    cost: str  # what costs 1 in a step, in words
+    build: Callable[..., Any] | str  # called with options by keyword, returns an `Environment`; or "module:attribute"
+    family: str = "registered"  # which table the task is a row of, to list related tasks together
+    # This task's own options, with the values that they have by default.
+    options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
+    common: frozenset[str] = frozenset(COMMON)  # those of `envs.options.COMMON` that `build` takes
+    obs_dim: int | None = None  # None: known only once the task is built
+    action_dim: int | None = None  # None: known only once the task is built
+    max_episode_steps: int | None = _MAX_EPISODE_STEPS  # the default; None: known only once the task is built
+    cost_limit: float | None = None  # default episode cost allowed to the expert that records demonstrations
+    cost: str = ""  # what costs how much in a step, in words
+    expert_preset: str = "expert"  # the hyperparameters that an expert starts from, a key of `ccil_jax.config.PRESETS`
+    original: str | None = None  # the environment that the task is compared with
+    original_package: Literal["gymnasium", "safety_gymnasium"] | None = None  # which has that environment
+    # Options of that environment which make its observations those of the task.
+    original_options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
+    # How a report draws an episode: bodies seen from the "side" or from "above", or a map of the whole "arena".
+    view: Literal["side", "above", "arena"] | None = None
+
+    def make(self, physics: str, options: Mapping[str, Any]) -> Any:
+        """Builds the task. `options` has any of its options; what is absent has the default.
+
+        Raises:
+            ValueError: the task has no such option, it cannot have that value, or what was built is no `Environment`
+                of the promised sizes.
+        """
+        check_options(self, physics, options)
+        arguments = {**self.options, **options}
+        if "physics" in self.common:
+            arguments["physics"] = physics
+        if "max_episode_steps" in self.common and self.max_episode_steps is not None:
+            arguments.setdefault("max_episode_steps", self.max_episode_steps)
+        build = named_object(self.build) if isinstance(self.build, str) else self.build
+        env = build(**arguments)
+        if missing := [member for member in _MEMBERS if not hasattr(env, member)]:
+            raise ValueError(
+                f"{self.name}: what was built, a {type(env).__name__}, has no {', '.join(missing)}; "
+                "return an envs.Environment"
+            )
+        for member in ("obs_dim", "action_dim"):
+            wanted, found = getattr(self, member), getattr(env, member)
+            if wanted not in (None, found):
+                raise ValueError(f"{self.name}: {member} is {found}, but registered as {wanted}; correct either")
+        return env
+
+
+def _build(target: str, name: str, **options: Any) -> Any:
+    return own_object(target)(name, **options)
 
 
 def _locomotion(
-    name: str, dims: tuple[int, int], cost_threshold: float, cost_limit: float, quantity: str, *, contact: bool = False
+    name: str,
+    dims: tuple[int, int],
+    cost_threshold: float,
+    cost_limit: float,
+    quantity: str,
+    *,
+    contact: bool = False,
+    view: Literal["side", "above"] = "side",
 ) -> TaskInfo:
     """A row; `contact` says that the cost counts contacts, so that there is a choice to leave them out."""
-    contact_cost = {"contact_cost": True} if contact else {}
     return TaskInfo(
         name=name,
+        build=functools.partial(_build, "envs.locomotion:make", name),
         family="locomotion",
         obs_dim=dims[0],
         action_dim=dims[1],
-        options=MappingProxyType({"cost_threshold": cost_threshold, **contact_cost}),
+        options=MappingProxyType({"cost_threshold": cost_threshold, **({"contact_cost": True} if contact else {})}),
         cost_limit=cost_limit,
-        original=f"{name}-v5",
         cost=f"{quantity} > {cost_threshold:g}",
+        original=f"{name}-v5",
+        original_package="gymnasium",
+        original_options=MappingProxyType({"include_cfrc_ext_in_observation": False} if contact else {}),
+        view=view,
     )
 
 
@@ -49,18 +113,21 @@ _BUTTON = f"{_HAZARD}, it touches a wrong button or a gremlin"
 def _safety_gym(name: str, dims: tuple[int, int], cost: str) -> TaskInfo:
     return TaskInfo(
         name=name,
+        build=functools.partial(_build, "envs.safety_gym.environment:SafetyGym", name),
         family="safety_gym",
         obs_dim=dims[0],
         action_dim=dims[1],
-        options=MappingProxyType({}),
         cost_limit=25.0,  # of the published results on these tasks (Ray et al. 2019)
-        original=f"Safety{name}-v0",
         cost=cost,
+        expert_preset="safety_gym_expert",
+        original=f"Safety{name}-v0",
+        original_package="safety_gymnasium",
+        view="arena",
     )
 
 
 _ROWS = (
-    _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s"),
+    _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s", view="above"),
     _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
     _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
     _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
@@ -75,80 +142,131 @@ _ROWS = (
     _safety_gym("DoggoGoal1", (104, 12), _HAZARD),
     _safety_gym("DoggoButton1", (120, 12), _BUTTON),
 )
-TASKS: Mapping[str, TaskInfo] = MappingProxyType({task.name: task for task in _ROWS})
+_tasks = {task.name: task for task in _ROWS}  # the registry; `register` alone changes it
+TASKS: Mapping[str, TaskInfo] = MappingProxyType(_tasks)  # a view that nobody can write to
+
+
+def register(
+    name: str,
+    build: Callable[..., Any] | str,
+    *,
+    options: Mapping[str, Any] | None = None,
+    obs_dim: int | None = None,
+    action_dim: int | None = None,
+    cost_limit: float | None = None,
+    cost: str = "",
+    expert_preset: str = "expert",
+    original: str | None = None,
+) -> TaskInfo:
+    """Adds a task to `TASKS`, so that `envs.make(name)` builds it.
+
+    Args:
+        name: of letters, digits, "_", "." and "-".
+        build: called with the task's options by keyword; returns an `Environment`. Or a text, "module:attribute",
+            which names such a callable and is looked up when the task is built.
+        options: names of the task's own options and the values that they have by default. By default these are the
+            parameters of `build`. A text is not looked up yet, so there they have to be said; of the options that
+            all built-in tasks have (`physics`, `max_episode_steps`, `num_threads`) it has to take every one.
+        obs_dim: length of an observation, if it is known beforehand.
+        action_dim: length of an action, if it is known beforehand.
+        cost_limit: default episode cost that is allowed to an expert which records demonstrations.
+        cost: what costs how much in a step, in words.
+        expert_preset: key of `ccil_jax.config.PRESETS`, the hyperparameters that an expert starts from.
+        original: the environment that the task is compared with.
+
+    Returns:
+        The task's entry.
+
+    Raises:
+        ValueError: the name is taken or has other characters, or a parameter of `build` lacks a default value.
+    """
+    if not re.fullmatch(r"[\w.-]+", str(name)):
+        raise ValueError(f"{name!r}: the name of a task is of letters, digits, '_', '.' and '-'; choose such a name")
+    if name in _tasks:
+        raise ValueError(f"{name}: a task of this name is registered already; choose another name")
+    task = TaskInfo(
+        name=name,
+        build=build,
+        obs_dim=obs_dim,
+        action_dim=action_dim,
+        cost_limit=cost_limit,
+        cost=cost,
+        expert_preset=expert_preset,
+        original=original,
+    )
+    if not isinstance(build, str):
+        task = _with_signature(task)
+    _tasks[name] = task if options is None else dataclasses.replace(task, options=MappingProxyType(dict(options)))
+    return _tasks[name]
+
+
+def _with_signature(task: TaskInfo) -> TaskInfo:
+    """`task` with the options that the signature of its `build` shows. Raises `ValueError` where one has no default."""
+    if not callable(task.build):
+        raise ValueError(
+            f"{task.name}: what builds a task must be a function or a class, not {type(task.build).__name__}; "
+            "give one that returns an envs.Environment"
+        )
+    options, common = {}, {}
+    for parameter in inspect.signature(task.build).parameters.values():
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            continue
+        if parameter.name in COMMON:
+            common[parameter.name] = parameter.default
+        elif parameter.default is parameter.empty or parameter.kind is parameter.POSITIONAL_ONLY:
+            raise ValueError(
+                f"{task.name}: parameter {parameter.name!r} of what builds the task must have a default value and be "
+                "given by keyword; change its signature"
+            )
+        else:
+            options[parameter.name] = parameter.default
+    limit = common.get("max_episode_steps")
+    if limit is inspect.Parameter.empty:
+        limit = _MAX_EPISODE_STEPS
+    return dataclasses.replace(
+        task, options=MappingProxyType(options), common=frozenset(common), max_episode_steps=limit
+    )
 
 
 def find_task(name: Any) -> TaskInfo:
     """The description of a task.
 
+    Args:
+        name: a key of `TASKS`; or "module:attribute", a function or class that returns an `Environment` and whose
+            parameters are the task's options. Its module is imported, from the current folder too.
+
     Raises:
-        ValueError: there is no such task. The message names the one meant, as far as can be told: capitals are
-            ignored, and so are prefixes and versions of gymnasium and safety-gymnasium.
+        ValueError: there is no such task. The message names the one that was probably meant; to find it, upper and
+            lower case are taken for the same, as are the names of the environments that the tasks are compared with.
     """
-    if isinstance(name, str) and name in TASKS:
-        return TASKS[name]
-    spellings = {spelling.casefold(): task.name for task in _ROWS for spelling in (task.name, task.original)}
-    raise ValueError(f"{name}: unknown task; {_hint(str(name), spellings)}choose one of {', '.join(TASKS)}")
+    if isinstance(name, str) and name in _tasks:
+        return _tasks[name]
+    if isinstance(name, str) and ":" in name:
+        return _with_signature(TaskInfo(name=name, build=named_object(name)))
+    spellings = {
+        spelling.casefold(): task.name for task in _tasks.values() for spelling in (task.name, task.original or "")
+    }
+    raise ValueError(f"{name}: unknown task; {hint(str(name), spellings)}choose one of {', '.join(_tasks)}")
 
 
 def check_options(task: TaskInfo, physics: Any, options: Mapping[str, Any]) -> None:
     """Checks what `envs.make` was given besides the task.
 
     Raises:
-        ValueError: the task has no such option, or not such a value.
+        ValueError: the task has no such option, or it cannot have that value.
     """
-    if physics not in PHYSICS:
-        near = _hint(str(physics), {name: name for name in PHYSICS})
-        raise ValueError(f"{physics}: unknown physics; {near}choose one of {', '.join(PHYSICS)}")
-    known = {name: check for name, check in _CHECKS.items() if name in _COMMON_OPTIONS or name in task.options}
+    check_physics(physics)
+    names = [name for name in (*COMMON, *task.options) if name in task.common or name in task.options]
+    listed = f"its options are {', '.join(names)}" if names else "it has no options"
+    if physics != AUTO and "physics" not in names:
+        raise ValueError(f"{task.name}: physics {physics!r} has no effect, the task has no such option; leave it out")
     for name, value in options.items():
-        if name not in known:
-            near = _hint(name, {name: name for name in known})
-            raise ValueError(f"{task.name} has no option {name!r}; {near}its options are physics, {', '.join(known)}")
-        known[name](f"{task.name}: {name}", value)
+        if name == "physics" or name not in names:
+            raise ValueError(f"{task.name} has no option {name!r}; {hint(name, names)}{listed}")
+        if name in CHECKS:
+            CHECKS[name](f"{task.name}: {name}", value)
 
 
-def check_count(what: str, value: Any) -> None:
-    """Refuses with a `ValueError` what is not a whole number from 1 to 2^31 - 1, the largest that JAX counts to."""
-    try:
-        sound = not isinstance(value, bool) and 1 <= operator.index(value) < 2**31
-    except TypeError:
-        sound = False
-    if not sound:
-        raise ValueError(f"{what} {value!r}: must be a whole number from 1 to 2147483647")
-
-
-def _check_threads(what: str, value: Any) -> None:
-    if value is not None:
-        check_count(what, value)
-
-
-def _check_threshold(what: str, value: Any) -> None:
-    try:
-        sound = value is None or (not isinstance(value, bool | str) and 0 <= float(value) < math.inf)
-    except TypeError:
-        sound = False
-    if not sound:
-        raise ValueError(f"{what} {value!r}: must be a finite number that is not negative, or None for the task's own")
-
-
-def _check_switch(what: str, value: Any) -> None:
-    if not isinstance(value, bool):
-        raise ValueError(f"{what} {value!r}: must be True or False")
-
-
-_COMMON_OPTIONS = ("max_episode_steps", "num_threads")  # of every task
-_CHECKS: Mapping[str, Callable[[str, Any], None]] = MappingProxyType(
-    {
-        "max_episode_steps": check_count,
-        "num_threads": _check_threads,
-        "cost_threshold": _check_threshold,
-        "contact_cost": _check_switch,
-    }
-)
-
-
-def _hint(name: str, spellings: Mapping[str, str]) -> str:
-    """A question that names what was probably meant, or nothing. Of equally near spellings it takes the first."""
-    near = difflib.get_close_matches(name.casefold(), spellings, n=1, cutoff=0.6)
-    return f"did you mean {spellings[near[0]]}? " if near else ""
+def physics_name(env: Any) -> str:
+    """The engine that an environment runs on, for records; the name of its class where it does not say."""
+    return str(getattr(env, "physics_name", type(env).__name__))

@@ -233,7 +233,7 @@ def test_ablations_give_what_is_shared_to_those_who_use_it_and_refuse_what_nobod
     assert answers["meta_gradient", "none"].plan.config == Config.from_preset(
         "paper", method="malm", meta_gradient="none"
     ).replace(cost_limit=answers["gate", "batch"].plan.config.cost_limit)
-    with pytest.raises(ConfigError, match="^gate episode: makes no difference to this run of method malm"):
+    with pytest.raises(ConfigError, match=r"^gate episode: makes no difference to this run of method malm"):
         ablations.ask(["meta_gradient"], {**shared, "gate": "episode"}, tmp_path)
 
 

@@ -40,12 +40,12 @@ class TaskInfo(Protocol):
         """Key of `envs.TASKS`."""
 
     @property
-    def obs_dim(self) -> int:
-        """Entries of an observation."""
+    def obs_dim(self) -> int | None:
+        """Entries of an observation; None where they are not known before the task is built."""
 
     @property
-    def action_dim(self) -> int:
-        """Entries of an action."""
+    def action_dim(self) -> int | None:
+        """Entries of an action; None where they are not known before the task is built."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,7 +186,7 @@ def check_matches(demonstrations: Demonstrations, path: str | os.PathLike[str], 
         )
     for key, name in (("obs", "obs_dim"), ("actions", "action_dim")):
         found, wanted = getattr(demonstrations, key).shape[1], getattr(task, name)
-        if found != wanted:
+        if wanted not in (None, found):
             raise DemonstrationsError(
                 f"{path}: '{key}' has {found} columns, {task.name} has {name} {wanted}; use a file of this task"
             )

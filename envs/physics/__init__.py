@@ -1,28 +1,20 @@
-"""Interchangeable physics: one pure `step`, several engines. `make_physics` chooses."""
+"""Interchangeable physics: one pure `step`, several engines. `make_physics` builds one by its name."""
 
-import importlib.util
 from collections.abc import Sequence
+from typing import Any
 
-import jax
 import mujoco
 
+from envs.engines import find_engine
+from envs.lookup import own_object
 from envs.physics.base import Data, Mocap, Physics
 
 __all__ = ["Data", "Mocap", "Physics", "make_physics", "resolve"]
 
 
 def resolve(name: str) -> str:
-    """What "auto" stands for; other names pass.
-
-    "native" where JAX's default device is a CPU, "warp" where it is NVIDIA's and `mujoco-mjx[warp]` is installed, "mjx"
-    elsewhere.
-    """
-    if name != "auto":
-        return name
-    if jax.default_backend() == "cpu":
-        return "native"
-    nvidia = jax.devices()[0].device_kind.startswith("NVIDIA")
-    return "warp" if nvidia and importlib.util.find_spec("warp") else "mjx"
+    """The name of the engine that "auto" stands for on this machine (see `find_engine`); other names pass."""
+    return find_engine(name).name
 
 
 def make_physics(
@@ -35,29 +27,27 @@ def make_physics(
     refresh: bool = False,
     num_threads: int | None = None,
 ) -> Physics:
-    """Builds a backend.
+    """Builds an engine for a model.
 
     Args:
-        name: "auto", "native", "mjx" or "warp".
-        model: the compiled model; the backend does not modify it.
+        name: "auto" or a row of `envs.engines.ENGINES`.
+        model: the compiled model; the engine does not modify it.
         num_substeps: engine steps per control step.
-        fields: derived `MjData` arrays that `Data.fields` shall hold, e.g. "cfrc_ext".
-        track: `MjData` arrays whose change over the control step `Data.change` shall hold, e.g. "qpos".
+        fields: derived `MjData` arrays that `Data.fields` shall hold, for example "cfrc_ext".
+        track: `MjData` arrays whose change over the control step `Data.change` shall hold, for example "qpos".
         refresh: whether a control step ends with a forward pass, so that `Data.fields` belong to the new state.
-        num_threads: of `native`; None shares the usable CPUs among the local devices. The other backends ignore it.
+        num_threads: threads of an engine that has some ("native"); None shares the usable CPUs among JAX's local
+            devices.
 
     Raises:
-        ValueError: unknown name.
+        ValueError: there is no such engine, or `num_threads` is given for one without threads.
         ImportError: "warp" without the extra `mujoco-mjx[warp]`.
     """
-    name = resolve(name)
-    if name == "native":
-        from envs.physics.native import NativePhysics
-
-        return NativePhysics(model, num_substeps, fields=fields, track=track, refresh=refresh, num_threads=num_threads)
-    if name in ("mjx", "warp"):
-        from envs.physics.mjx import MjxPhysics
-
-        impl = "jax" if name == "mjx" else "warp"
-        return MjxPhysics(model, num_substeps, fields=fields, track=track, refresh=refresh, impl=impl)
-    raise ValueError(f"unknown physics {name!r}: choose one of auto, native, mjx, warp")
+    engine = find_engine(name)
+    arguments: dict[str, Any] = {"fields": fields, "track": track, "refresh": refresh, **engine.arguments}
+    if engine.has_threads:
+        arguments["num_threads"] = num_threads
+    elif num_threads is not None:
+        raise ValueError(f"num_threads {num_threads} has no effect with physics {engine.name!r}; leave it out")
+    physics: Physics = own_object(engine.build)(model, num_substeps, **arguments)
+    return physics

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 
 from envs import physics as physics_lib
 from envs.base import State, check_shape, executed, first_state, next_state
+from envs.engines import find_engine
 from envs.jax_tools import compute_where
 from envs.physics import Mocap
 from envs.safety_gym import layout as layouts
@@ -62,7 +63,7 @@ class SafetyGym:
         self.name = name
         self.task = task = TABLE[name]
         self.max_episode_steps = max_episode_steps
-        self.scene = scene = scenes.build(task, prisms=physics_lib.resolve(physics) != "native")
+        self.scene = scene = scenes.build(task, prisms=find_engine(physics).needs_prisms)
         self.model = model = scene.model
         self.num_substeps = scenes.SUBSTEPS
         self.dt = float(model.opt.timestep) * self.num_substeps

@@ -134,11 +134,10 @@ def make_simulator(env: Any) -> Any:
     """Gymnasium's own environment of `env`'s task, with the same observations and time limit."""
     import gymnasium
 
-    return gymnasium.make(
-        TASKS[env.name].original,
-        max_episode_steps=env.max_episode_steps,
-        **({"include_cfrc_ext_in_observation": False} if env.name in ("Ant", "Humanoid") else {}),
-    )
+    task = TASKS[env.name]
+    if task.original is None:
+        raise ValueError(f"{task.name}: has no original in gymnasium; evaluate it in our own simulator")
+    return gymnasium.make(task.original, max_episode_steps=env.max_episode_steps, **task.original_options)
 
 
 def run_episode(
