@@ -15,9 +15,9 @@ from typing import Any
 
 from ccil_jax.config import PRESETS, Config, check_used, unused
 from ccil_jax.demonstrations.trajectories import load_demonstrations
-from experiments import train
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import plans
 from experiments.sweeps import comparison, dispatch
 from experiments.sweeps.comparison import Row
 from experiments.sweeps.variants import Variant, make_variant
@@ -115,7 +115,7 @@ def make_parser() -> Parser:
         help=f"of {', '.join(QUESTIONS)} (default: all)",
     )
     dispatch.add_options(parser)
-    train.add_options(parser, with_method=False)
+    plans.add_options(parser, with_method=False)
     return parser
 
 

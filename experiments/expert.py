@@ -17,7 +17,8 @@ from ccil_jax.demonstrations.trajectories import save_demonstrations
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
-from experiments.runs.execution import Plan, execute
+from experiments.runs.execution import execute
+from experiments.runs.plans import Plan
 from experiments.runs.recording import choose_seed, facts, print_demonstrations, record
 from experiments.runs.resuming import resumed
 

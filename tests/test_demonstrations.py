@@ -19,7 +19,7 @@ from ccil_jax.demonstrations.trajectories import (
 )
 from ccil_jax.errors import DemonstrationsError
 from experiments import train
-from experiments.runs.execution import Plan
+from experiments.runs.plans import Plan
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,9 +16,9 @@ import pytest
 from matplotlib.patches import Rectangle
 
 from ccil_jax.config import Config
+from ccil_jax.training.progress import Display
 from experiments import benchmark, report
 from experiments.cli.command_line import UsageError
-from experiments.cli.progress import Display
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.summary import Reference, aggregate_scores, scores
 

@@ -9,45 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ccil_jax.config import Config
-from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training import filesystem
 from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.progress import Display
 from experiments.cli import xla
 from experiments.cli.interruption import Interruption
-from experiments.cli.progress import Display
 from experiments.runs import fault_files, run_folder, summary
+from experiments.runs.plans import Plan
 
 if TYPE_CHECKING:
     from ccil_jax.acting.evaluation import Evaluation
     from ccil_jax.training.runner import History, Progress, Result
-
-_EVALUATION_SEED_OFFSET = 10_000_019  # keeps evaluation episodes apart from training with the same --seed
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Everything that was decided, and checked, before JAX is imported."""
-
-    config: Config  # with its cost limit resolved
-    preset: str
-    task: str
-    physics: str
-    env_options: dict[str, Any]  # of `envs.make`: cost_threshold (per step), contact_cost, max_episode_steps
-    demonstrations: Demonstrations | None
-    demonstrations_path: Path | None
-    num_seeds: int
-    seed: int
-    one_by_one: bool
-    folder: Path
-    resume: bool
-    eval_episodes: int
-    command: str
-    moved: tuple[str, ...] = ()  # fields of `config` that are not those of the training that is resumed
-
-    @property
-    def evaluation_seed(self) -> int:
-        """Seed of the evaluation episodes."""
-        return (self.seed + _EVALUATION_SEED_OFFSET) % 2**32
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.config import Config
+from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number, show
 from experiments.runs import run_folder
 from experiments.runs.intervals import bootstrap_interval
-from experiments.runs.summary import BEYOND_ERROR, NO_INTERVAL, bounds, marked, number, show
+from experiments.runs.summary import NO_INTERVAL
 from experiments.sweeps.variants import Variant
 
 SCORES = ("episode_return", "episode_cost", "recovered_return", "relative_cost_violation")

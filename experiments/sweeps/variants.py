@@ -17,10 +17,9 @@ from typing import Any, NoReturn
 from ccil_jax.config import Config, field_names, relevant
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
 from ccil_jax.training.filesystem import file_sha256
-from experiments import train
 from experiments.cli.command_line import Parser, UsageError
-from experiments.runs import run_folder
-from experiments.runs.execution import Plan
+from experiments.runs import plans, run_folder
+from experiments.runs.plans import Plan
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -77,10 +76,10 @@ def _variant(
     name: str, given: Sequence[str], out: Path, load: Callable[[Path], Demonstrations], *, alone: bool = False
 ) -> Variant:
     parser = _OptionParser("train", "")
-    train.add_options(parser)
+    plans.add_options(parser)
     folder = out / "runs" / name
     resume = (folder / "config.json").is_file()
-    plan = train.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
+    plan = plans.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
     return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
 
 
