@@ -9,7 +9,7 @@ from experiments.cli import command_line
 from experiments.cli.command_line import Parser
 from experiments.runs import plans
 from experiments.runs.execution import execute
-from experiments.runs.plans import Plan
+from experiments.runs.plans import RunPlan
 from experiments.runs.resuming import resumed
 
 
@@ -22,8 +22,8 @@ def make_parser() -> Parser:
     return parser
 
 
-def make_plan(arguments: argparse.Namespace) -> Plan:
-    """Turns the options into a `Plan`. Raises `UsageError`, `ConfigError` or `DemonstrationsError` for wrong input."""
+def make_plan(arguments: argparse.Namespace) -> RunPlan:
+    """Turns the options into the plan of a run. Raises a `UserError` for wrong input."""
     given = {k: v for k, v in vars(arguments).items() if k not in ("out", "resume")}
     saved = resumed(arguments.out, given) if arguments.resume else {}
     plan = plans.plan_of(given, arguments.out, resume=arguments.resume, saved=saved)

@@ -23,8 +23,8 @@ Row = dict[str, Any]
 def row(variant: Variant) -> Row:
     """What a finished variant came to: scores with intervals over seeds, its multiplier, its speed."""
     summary = run_folder.read_json(variant.plan.folder / "summary.json")
-    content: Row = {"variant": variant.name, "task": variant.plan.task, "method": variant.plan.config.method}
-    content |= {"num_seeds": variant.plan.num_seeds, "env_steps": summary["env_steps"]}
+    content: Row = {"variant": variant.name, "task": variant.plan.setup.task, "method": variant.plan.config.method}
+    content |= {"num_seeds": variant.plan.setup.num_seeds, "env_steps": summary["env_steps"]}
     for name in SCORES:
         values = [seed[name] for seed in summary["per_seed"]]
         interval = None if None in values else bootstrap_interval([np.array(values)])
