@@ -93,10 +93,12 @@ def make(
     return environment
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'envs' has no attribute {name!r}")
+if not TYPE_CHECKING:  # a type checker knows all names, and should report others
+
+    def __getattr__(name: str) -> Any:
+        if name in _LAZY:
+            return getattr(importlib.import_module(_LAZY[name]), name)
+        raise AttributeError(f"module 'envs' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -29,7 +29,7 @@ def test_single_episodes_are_those_of_our_own_environment() -> None:
     env = gymnasium.make("ccil/Swimmer-v0", physics="native", max_episode_steps=3, cost_threshold=0.01)
     vector = gymnasium.make_vec("ccil/Swimmer-v0", 1, physics="native", max_episode_steps=3, cost_threshold=0.01)
     rng = np.random.default_rng(0)
-    runs = []
+    runs: list[dict[str, np.ndarray]] = []
     for _ in range(2):
         actions = rng.uniform(-1, 1, (6, 2)).astype(np.float32) if not runs else runs[0]["actions"]
         obs, _ = env.reset(seed=7)

@@ -149,14 +149,16 @@ class GymnasiumVectorEnv(VectorEnv):
 
 
 def make_single(task: str, render_mode: str | None = None, **options: Any) -> GymnasiumEnv:
-    """What `gymnasium.make` calls. The time limit is that of the wrapper which gymnasium adds, `TimeLimit`.
+    """What `gymnasium.make` calls. Episodes are truncated by gymnasium's wrapper `TimeLimit`, which it adds itself.
 
     Args:
         task: see `envs.make`.
         render_mode: None.
         **options: of `envs.make`.
     """
-    return GymnasiumEnv(envs.make(task, **{"max_episode_steps": _NO_LIMIT, **options}), render_mode)
+    if "max_episode_steps" in envs.find_task(task).common:
+        options = {"max_episode_steps": _NO_LIMIT, **options}
+    return GymnasiumEnv(envs.make(task, **options), render_mode)
 
 
 def make_vector(task: str, num_envs: int, render_mode: str | None = None, **options: Any) -> GymnasiumVectorEnv:
