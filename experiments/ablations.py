@@ -16,9 +16,9 @@ from typing import Any
 from ccil_jax.config import Config, check_used, unused
 from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.presets import PRESETS
-from experiments import train
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import plans
 from experiments.sweeps import comparison, dispatch
 from experiments.sweeps.comparison import Row
 from experiments.sweeps.variants import Variant, make_variant
@@ -116,7 +116,7 @@ def make_parser() -> Parser:
         help=f"of {', '.join(QUESTIONS)} (default: all)",
     )
     dispatch.add_options(parser)
-    train.add_options(parser, with_method=False)
+    plans.add_options(parser, with_method=False)
     return parser
 
 

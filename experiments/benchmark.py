@@ -23,8 +23,8 @@ from ccil_jax.training.versions import versions
 from envs.registry import PHYSICS
 from experiments.cli import command_line, interruption, options, xla
 from experiments.cli.command_line import Parser, UsageError
+from experiments.cli.tables import show
 from experiments.runs import run_folder
-from experiments.runs.summary import show
 from experiments.speed import peers
 from experiments.sweeps import backends
 

@@ -17,7 +17,8 @@ from ccil_jax.demonstrations.trajectories import save_demonstrations
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
-from experiments.runs.execution import Plan, execute
+from experiments.runs.execution import execute
+from experiments.runs.plans import RunPlan, make_setup
 from experiments.runs.recording import choose_seed, facts, print_demonstrations, record
 from experiments.runs.resuming import resumed
 
@@ -53,8 +54,8 @@ def make_parser() -> Parser:
     return parser
 
 
-def make_plan(arguments: argparse.Namespace) -> Plan:
-    """Turns the options into a `Plan`. Raises `UsageError` or `ConfigError` for wrong input."""
+def make_plan(arguments: argparse.Namespace) -> RunPlan:
+    """Turns the options into the plan of a run. Raises a `UserError` for wrong input."""
     own = ("out", "overwrite", "unconstrained", "num_trajectories", "run_dir", "resume")
     given = {k: v for k, v in vars(arguments).items() if k not in own}
     given["method"] = method = "trpo" if arguments.unconstrained else "expert"
@@ -73,22 +74,13 @@ def make_plan(arguments: argparse.Namespace) -> Plan:
     command_line.check_writable(arguments.out.parent, "--out")
     folder = arguments.run_dir or command_line.default_folder(task.name, method, "--run-dir")
     command_line.check_output_folder(folder, resume=arguments.resume, option="--run-dir")
-    return Plan(
+    return RunPlan(
+        setup=make_setup(choices, task, env_options, moved=MOVABLE if arguments.resume else ()),
         config=config,
         preset=preset,
-        task=task.name,
-        physics=choices["physics"],
-        env_options=env_options,
-        demonstrations=None,
-        demonstrations_path=None,
-        num_seeds=choices["num_seeds"],
-        seed=choices["seed"],
-        one_by_one=choices["one_by_one"],
         folder=folder,
         resume=arguments.resume,
-        eval_episodes=choices["eval_episodes"],
         command=command_line.command(),
-        moved=MOVABLE if arguments.resume else (),
     )
 
 
@@ -132,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
         outcome.result.agent,
         outcome.env,
         num_trajectories=arguments.num_trajectories,
-        episode_seed=(plan.evaluation_seed + 1) % 2**32,
+        episode_seed=(plan.setup.evaluation_seed + 1) % 2**32,
         facts=facts(trained, outcome.summary, seed, trained.facts["command"]),
     )
     save_demonstrations(arguments.out, demonstrations)

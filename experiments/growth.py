@@ -17,8 +17,8 @@ from ccil_jax.methods import METHODS
 from experiments import benchmark
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser
+from experiments.cli.tables import show
 from experiments.runs import run_folder
-from experiments.runs.summary import show
 
 DEMONSTRATIONS = 10_000  # steps, where they do not vary
 AXES: Mapping[str, tuple[int, ...]] = {

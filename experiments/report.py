@@ -13,11 +13,11 @@ import numpy as np
 from ccil_jax.config import relevant
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
+from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number
 from experiments.runs import run_folder
 from experiments.runs.intervals import bootstrap_interval
 from experiments.runs.labels import distinct_names
 from experiments.runs.run_folder import Run
-from experiments.runs.summary import BEYOND_ERROR, bounds, marked, number
 
 _NEEDED = {"num_seeds", "per_seed", "env_steps", "env_steps_per_second", "expert_cost"}  # of summary.json
 _COLUMNS = (

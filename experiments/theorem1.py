@@ -13,7 +13,7 @@ from pathlib import Path
 
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser
-from experiments.runs.summary import show
+from experiments.cli.tables import show
 from experiments.theory import theorem1_checks
 from experiments.theory.theorem1_checks import Check
 

@@ -12,7 +12,7 @@ from ccil_jax.config import Config, validate
 from ccil_jax.methods import METHODS
 from experiments import ablations
 from experiments.ablations import QUESTIONS
-from experiments.runs import run_folder
+from experiments.runs import plans, run_folder
 from experiments.sweeps import comparison, comparison_figures, variants
 from experiments.sweeps.comparison import Row, multiplier_path
 
@@ -47,22 +47,22 @@ def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: P
     } in names
     assert sum(map(len, names)) == len(different)
     # As few as there are static configurations, and at most one more for each baseline's speed.
-    static = {variants.static_part(variant.plan.config) for variant in different.values()}
+    static = {plans.static_values(variant.plan.config) for variant in different.values()}
     assert len(static) < len(programs) <= len(static) + sum(variant.alone for variant in different.values())
 
 
 def test_a_program_is_the_same_to_its_worker(tmp_path: Path) -> None:
     shared = {**SHARED, "hidden_sizes": (8, 8), "num_demos": 3, "bootstrap_at_truncation": False}
     chosen = ablations.ask(["windup"], shared, tmp_path).values()
-    for program in variants.group(chosen, tmp_path):
-        variants.write_program(program)
-        read = variants.read_program(program.folder)
-        for variant, again in zip(program.variants, read.variants, strict=True):
+    for job in variants.group(chosen, tmp_path):
+        variants.write_job(job)
+        read = variants.read_job(job.folder)
+        for variant, again in zip(job.variants, read.variants, strict=True):
             assert again.plan.config == variant.plan.config
             assert again.plan.folder == variant.plan.folder
             assert again.plan.config.hidden_sizes == (8, 8)
-            assert again.plan.demonstrations is not None
-            assert again.plan.demonstrations.num_episodes == 3
+            assert again.plan.setup.demonstrations is not None
+            assert again.plan.setup.demonstrations.num_episodes == 3
 
 
 def test_the_path_of_a_multiplier() -> None:
@@ -132,7 +132,8 @@ def test_few_seeds_have_no_interval_and_violations_are_marked(
         run_folder.write_json(folder / "summary.json", {"per_seed": seeds, **levels, "runs_in_program": 2, **marks})
         with run_folder.MetricsWriter(folder) as writer:
             writer.begin({"env_steps": np.ones((1, 2)), "multiplier": np.zeros((1, 2))})
-        plan = SimpleNamespace(folder=folder, task="Swimmer", num_seeds=2, config=Config(method="cvag"))
+        setup = SimpleNamespace(task="Swimmer", num_seeds=2)
+        plan = SimpleNamespace(folder=folder, setup=setup, config=Config(method="cvag"))
         rows.append(comparison.row(SimpleNamespace(name=name, plan=plan)))
     comparison.write_csv(tmp_path / "t.csv", rows)
     with (tmp_path / "t.csv").open(newline="") as file:

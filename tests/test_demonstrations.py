@@ -19,7 +19,7 @@ from ccil_jax.demonstrations.trajectories import (
 )
 from ccil_jax.errors import DemonstrationsError
 from experiments import train
-from experiments.runs.execution import Plan
+from experiments.runs.plans import Setup
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,14 +220,14 @@ def test_training_refuses_trajectories_longer_than_its_episodes(tmp_path: Path) 
     save_demonstrations(tmp_path / "d.npz", make(metadata={}))
     parser = train.make_parser()
 
-    def plan(*options: str) -> Plan:
+    def setup(*options: str) -> Setup:
         given = ["--method", "ccil", "--env", "Swimmer", "--demos", str(tmp_path / "d.npz"), *options]
-        return train.make_plan(parser.parse_args([*given, "--out", str(tmp_path / "run")]))
+        return train.make_plan(parser.parse_args([*given, "--out", str(tmp_path / "run")])).setup
 
-    assert plan("--max-episode-steps", "3").demonstrations is not None
-    assert plan("--max-episode-steps", "2", "--num-demos", "1").demonstrations is not None
+    assert setup("--max-episode-steps", "3").demonstrations is not None
+    assert setup("--max-episode-steps", "2", "--num-demos", "1").demonstrations is not None
     with pytest.raises(DemonstrationsError, match=r"d\.npz: trajectory 1 has 3 steps, .* at most 2; "):
-        plan("--max-episode-steps", "2")
+        setup("--max-episode-steps", "2")
 
 
 def test_a_missing_array_is_refused_when_saved(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ import pytest
 from matplotlib.patches import Rectangle
 
 from ccil_jax.config import Config
+from ccil_jax.training.progress import Display
 from experiments import benchmark, report
 from experiments.cli.command_line import UsageError
-from experiments.cli.progress import Display
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.summary import Reference, aggregate_scores, scores
 
@@ -323,7 +323,9 @@ def test_the_summary_is_the_last_file_of_a_run(
     folder = make_run(tmp_path / "a", "gail", num_seeds=2)
     (folder / "summary.json").unlink()
     plan: Any = types.SimpleNamespace(
-        folder=folder, config=Config(method="gail"), task="Swimmer", num_seeds=2, eval_episodes=2, demonstrations=None
+        folder=folder,
+        config=Config(method="gail"),
+        setup=types.SimpleNamespace(task="Swimmer", num_seeds=2, eval_episodes=2, demonstrations=None),
     )
     result: Any = types.SimpleNamespace(env_steps=30_000, wall_seconds=1.0, compile_seconds=1.0)
     values = np.array([[1.0, 3.0], [5.0, 9.0]])

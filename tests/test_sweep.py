@@ -101,7 +101,7 @@ def swimmer_demonstrations(seed: int) -> Demonstrations:
 def test_variants_share_what_they_read(tmp_path: Path) -> None:
     spec = {"env": "Swimmer", "method": "ccil", "fixed": {"preset": "tiny"}, "grid": {"gamma": [0.9, 0.99]}}
     found = sweep.variants_of(tmp_path / "s.json", spec, tmp_path)
-    one, other = (variant.plan.demonstrations for variant, _ in found.values())
+    one, other = (variant.plan.setup.demonstrations for variant, _ in found.values())
     assert one is not None
     assert one is other
 
@@ -151,9 +151,9 @@ def test_static_fields_make_programs_and_traced_fields_share_them(tmp_path: Path
     spec = {"env": "Swimmer", "method": "expert", "fixed": FIXED, "grid": grid}
     found = sweep.variants_of(tmp_path / "s.json", spec, tmp_path)
     assert len(found) == 2 * 2 * 3 * 2 * 2
-    programs = variants.group([variant for variant, _ in found.values()], tmp_path)
-    assert [len(program.variants) for program in programs] == [2 * 3] * (2 * 2 * 2)  # sizes, dual steps, base seeds
-    assert len({program.folder for program in programs}) == 8
+    jobs = variants.group([variant for variant, _ in found.values()], tmp_path)
+    assert [len(job.variants) for job in jobs] == [2 * 3] * (2 * 2 * 2)  # sizes, dual steps, base seeds
+    assert len({job.folder for job in jobs}) == 8
 
 
 class Killer(threading.Thread):
@@ -351,9 +351,9 @@ def test_a_program_that_fails_is_reported(tmp_path: Path) -> None:
 
 def small_program(out: Path) -> Path:
     fields = {**SPEC["fixed"], "env": "Swimmer", "method": "expert", "hidden_sizes": [4]}
-    (program,) = variants.group([variants.make_variant("expert", fields, out)], out)
-    variants.write_program(program)
-    return program.folder
+    (job,) = variants.group([variants.make_variant("expert", fields, out)], out)
+    variants.write_job(job)
+    return job.folder
 
 
 def test_ray_places_programs_on_a_cluster_of_two_nodes(tmp_path: Path) -> None:

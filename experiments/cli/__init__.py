@@ -1,1 +1,1 @@
-"""What all launchers share on the command line: options, errors, signals, progress and XLA's flags."""
+"""What all launchers share on the command line: options, errors, signals, tables and XLA's flags."""

@@ -1,65 +1,36 @@
-"""Training runs from checked choices to finished run folders; shared by `train`, `expert` and the sweeps' workers."""
+"""Carries out plans: from checked options to finished run folders. Launchers and the sweeps' workers share it."""
 
 import contextlib
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ccil_jax.config import Config
-from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training import filesystem
 from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.progress import Display
 from experiments.cli import xla
 from experiments.cli.interruption import Interruption
-from experiments.cli.progress import Display
 from experiments.runs import fault_files, run_folder, summary
+from experiments.runs.plans import ProgramPlan, RunPlan, Setup
 
 if TYPE_CHECKING:
     from ccil_jax.acting.evaluation import Evaluation
     from ccil_jax.training.runner import History, Progress, Result
 
-_EVALUATION_SEED_OFFSET = 10_000_019  # keeps evaluation episodes apart from training with the same --seed
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Plan:
-    """Everything that was decided, and checked, before JAX is imported."""
-
-    config: Config  # with its cost limit resolved
-    preset: str
-    task: str
-    physics: str
-    env_options: dict[str, Any]  # of `envs.make`: cost_threshold (per step), contact_cost, max_episode_steps
-    demonstrations: Demonstrations | None
-    demonstrations_path: Path | None
-    num_seeds: int
-    seed: int
-    one_by_one: bool
-    folder: Path
-    resume: bool
-    eval_episodes: int
-    command: str
-    moved: tuple[str, ...] = ()  # fields of `config` that are not those of the training that is resumed
-
-    @property
-    def evaluation_seed(self) -> int:
-        """Seed of the evaluation episodes."""
-        return (self.seed + _EVALUATION_SEED_OFFSET) % 2**32
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """A finished run: what was learnt and how it did."""
+    """A finished run: what was learnt and how well it does."""
 
-    plan: Plan  # as carried out
+    plan: RunPlan  # as carried out
     result: "Result"
     env: Any
     evaluation: "Evaluation"  # [num_seeds, num_episodes]
-    random: "Evaluation"  # [1, num_episodes]
-    summary: dict[str, Any]
+    random: "Evaluation"  # of the random policy, [1, num_episodes]
+    summary: dict[str, Any]  # the content of summary.json
 
     @property
     def status(self) -> int:
@@ -67,59 +38,53 @@ class Outcome:
         return int(self.result.stopped.any())
 
 
-def execute(plan: Plan) -> Outcome:
+def execute(plan: RunPlan) -> Outcome:
     """Trains, evaluates, writes the whole run folder and prints the table. Raises as `execute_together` does."""
-    return execute_together([plan], plan.folder / "checkpoints", resume=plan.resume)[0]
+    alone = ProgramPlan(runs=(plan,), checkpoint_dir=plan.folder / "checkpoints", resume=plan.resume)
+    return execute_together(alone)[0]
 
 
-def execute_together(
-    plans: Sequence[Plan], checkpoint_dir: Path, *, resume: bool, finished: Collection[Path] = ()
-) -> list[Outcome]:
-    """Carries out plans that differ in traced hyperparameters and folders alone as one program.
+def execute_together(program: ProgramPlan) -> list[Outcome]:
+    """Trains and evaluates all runs of a program, completes their folders and prints a table for each.
 
-    Args:
-        plans: all runs of the program.
-        checkpoint_dir: holds the checkpoints of all their runs together; in the end each folder has those of its own.
-        resume: whether training goes on from the newest checkpoint there, if there is one.
-        finished: run folders that are complete: they stay as they are, and have no outcome.
+    Returns:
+        An outcome for each run that was not finished before, in the order of the runs.
 
     Raises:
+        UserError: what can be known only now does not fit, such as the sizes of a task, or the checkpoints cannot be
+            continued or written.
         LockedError: another process works in the run folder.
         SystemExit: a signal ended the run; its state is saved.
     """
-    first = plans[0]
-    num_runs = sum(plan.num_seeds for plan in plans)
-    title = f"{first.config.method} {first.task}"
+    setup, config = program.setup, program.config
     with (
-        filesystem.hold(checkpoint_dir / ".run.lock"),
+        filesystem.hold(program.checkpoint_dir / ".run.lock"),
         Display(
-            title,
-            first.config.num_iterations,
-            first.config.cost_limit if len({plan.config.cost_limit for plan in plans}) == 1 else None,
-            has_multiplier=first.config.has_multiplier,
+            f"{config.method} {setup.task}",
+            config.num_iterations,
+            program.cost_limit,
+            has_multiplier=config.has_multiplier,
         ) as display,
         Interruption() as interruption,
     ):
-        several = f"{len(plans)} configurations of " if len(plans) > 1 else ""
-        display.message(
-            f"{first.config.method} on {first.task}: {several}{first.num_seeds} seed(s), "
-            f"{_length(first.config)} each, into {checkpoint_dir.parent}; compiling ..."
-        )
-        xla.spread_seeds(num_runs)
-        import envs  # with JAX behind it: not before the input has been checked
+        display.message(f"{_announcement(program)}; compiling ...")
+        xla.spread_seeds(program.num_runs)
+        import envs  # imports JAX, so that it has to wait until the input has been checked
 
-        env = envs.make(first.task, physics=first.physics, **first.env_options)
-        missing = {i: _with_earlier_commands(plan) for i, plan in enumerate(plans) if plan.folder not in finished}
-        for plan in missing.values():
-            if not plan.resume:  # else it is written once it is certain that the run goes on
+        env = envs.make(setup.task, physics=setup.physics, **setup.env_options)
+        todo = {
+            i: _with_earlier_commands(run) for i, run in enumerate(program.runs) if run.folder not in program.finished
+        }
+        for plan in todo.values():
+            if not plan.resume:  # of a resumed run it is written once it is certain that the run goes on
                 run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
-        results, rate = _train(plans, missing, env, checkpoint_dir, display, interruption, resume=resume)
-        carried_out = [(plan, results[i]) for i, plan in missing.items()]
-        for plan, result in carried_out:
+        results, rate = _train(program, todo, env, display, interruption)
+        trained = [(plan, results[i]) for i, plan in todo.items()]
+        for plan, result in trained:
             for seed in np.flatnonzero(result.stopped):
                 display.message(f"seed {seed} stopped: {fault_files.write(plan.folder, result, int(seed))}")
-        display.message(f"evaluating {first.eval_episodes} episodes per seed ...")
-        evaluations, random = _evaluate(carried_out, env)
+        display.message(f"evaluating {setup.eval_episodes} episodes per seed ...")
+        evaluations, random = _evaluate(setup, [result for _, result in trained], env)
         return [
             Outcome(
                 plan=plan,
@@ -127,136 +92,164 @@ def execute_together(
                 env=env,
                 evaluation=evaluated,
                 random=random,
-                summary=_finish(plan, result, rate, num_runs, evaluated, random),
+                summary=_finish(plan, result, rate, program.num_runs, evaluated, random),
             )
-            for (plan, result), evaluated in zip(carried_out, evaluations, strict=True)
+            for (plan, result), evaluated in zip(trained, evaluations, strict=True)
         ]
 
 
-def _length(config: Config) -> str:
-    return f"{config.bc_epochs} passes" if config.method == "bc" else f"{config.env_steps:,} steps"
+def _announcement(program: ProgramPlan) -> str:
+    setup, config = program.setup, program.config
+    several = f"{len(program.runs)} configurations of " if len(program.runs) > 1 else ""
+    length = f"{config.bc_epochs} passes" if config.method == "bc" else f"{config.env_steps:,} steps"
+    return (
+        f"{config.method} on {setup.task}: {several}{setup.num_seeds} seed(s), {length} each, into "
+        f"{program.checkpoint_dir.parent}"
+    )
 
 
-def _with_earlier_commands(plan: Plan) -> Plan:
-    """A resumed run was made by all its commands: the first, and those that continued it."""
+def _with_earlier_commands(plan: RunPlan) -> RunPlan:
+    """The plan with all commands that made the run: those before this process, one a line, and that of this process."""
     earlier = [run_folder.read_run(plan.folder).facts["command"]] if plan.resume else []
     return dataclasses.replace(plan, command="\n".join([*earlier, plan.command]))
 
 
-def _train(
-    plans: Sequence[Plan],
-    missing: Mapping[int, Plan],
-    env: Any,
-    checkpoint_dir: Path,
-    display: Display,
-    interruption: Interruption,
-    *,
-    resume: bool,
-) -> tuple[list["Result"], float | None]:
-    """The results, and environment steps per second of all runs, compilation aside (None if nothing was left to do).
+class _Recorder:
+    """Writes what the training reports into the folders of its runs, and measures its speed.
 
-    Only the plans `missing`, by their numbers, are written to their folders.
+    Args:
+        config: the static fields of all runs.
+        runs: each run that is to be recorded, with its columns in the reported metrics [iterations, num_runs].
+        env: the task that the runs are trained on.
+        stack: closes the files.
+    """
+
+    def __init__(
+        self, config: Config, runs: Sequence[tuple[RunPlan, slice]], env: Any, stack: contextlib.ExitStack
+    ) -> None:
+        self._steps_per_iteration = config.steps_per_iteration
+        self._plans, self._env = [plan for plan, _ in runs], env
+        self._writers = [
+            (stack.enter_context(run_folder.MetricsWriter(plan.folder)), columns) for plan, columns in runs
+        ]
+        self._steps = self._seconds = 0.0
+
+    def begin(self, history: "History") -> None:
+        """Before the first iteration; `history` has the metrics of those that an earlier process has done."""
+        for plan in self._plans:
+            if plan.resume:
+                run_folder.write_config(plan.folder, plan.config, _facts(plan, self._env))
+        for writer, columns in self._writers:
+            writer.begin({name: rows[:, columns] for name, rows in history.items()})
+
+    def write(self, progress: "Progress") -> None:
+        """After each chunk of iterations."""
+        steps = progress.metrics["env_steps"].size * self._steps_per_iteration
+        self._steps += steps
+        if steps:  # behaviour cloning takes none
+            self._seconds += steps / progress.env_steps_per_second
+        for writer, columns in self._writers:
+            writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
+
+    @property
+    def env_steps_per_second(self) -> float | None:
+        """Of all runs together, without compilation; None where no step was taken."""
+        return self._steps / self._seconds if self._seconds else None
+
+
+def _train(
+    program: ProgramPlan, todo: Mapping[int, RunPlan], env: Any, display: Display, interruption: Interruption
+) -> tuple[list["Result"], float | None]:
+    """Trains all runs of a program. Only those in `todo`, by their places among all, are written to their folders.
+
+    Returns:
+        The results of all runs, and the environment steps per second of all runs together.
     """
     from ccil_jax.training import runner
 
-    first, steps, seconds = plans[0], 0.0, 0.0
-    columns = runner.columns(len(plans), first.num_seeds)
-
+    setup, config = program.setup, program.config
+    columns = runner.columns(len(program.runs), setup.num_seeds)
     with contextlib.ExitStack() as stack:
-        writers = [
-            (stack.enter_context(run_folder.MetricsWriter(plan.folder)), columns[i]) for i, plan in missing.items()
-        ]
+        recorder = _Recorder(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
 
         def on_start(history: "History") -> None:
-            for plan in missing.values():
-                if plan.resume:
-                    run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
-            for writer, own in writers:
-                writer.begin({name: rows[:, own] for name, rows in history.items()})
+            recorder.begin(history)
             interruption.defer()
 
         def on_progress(progress: "Progress") -> None:
-            nonlocal steps, seconds
-            new_steps = progress.metrics["env_steps"].size * first.config.steps_per_iteration
-            steps += new_steps
-            if new_steps:  # behaviour cloning takes none
-                seconds += new_steps / progress.env_steps_per_second
-            for writer, own in writers:
-                writer.write(progress.iteration, {name: rows[:, own] for name, rows in progress.metrics.items()})
+            recorder.write(progress)
             display.update(progress)
 
         results = runner.train_runs(
-            [plan.config for plan in plans],
+            [plan.config for plan in program.runs],
             env,
-            first.demonstrations,
-            num_seeds=first.num_seeds,
-            seed=first.seed,
-            one_by_one=first.one_by_one,
-            checkpoint_dir=checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
-            resume=resume,
-            moved=first.moved,
+            setup.demonstrations,
+            num_seeds=setup.num_seeds,
+            seed=setup.seed,
+            one_by_one=setup.one_by_one,
+            checkpoint_dir=program.checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
+            resume=program.resume,
+            moved=setup.moved,
             on_start=on_start,
             on_progress=on_progress,
             should_stop=interruption.requested,
         )
     done = len(results[0].metrics["env_steps"])
-    interruption.settle(
-        f"stopped and saved after iteration {done} of {first.config.num_iterations}; continue with --resume"
-    )
-    for i, plan in missing.items():
-        if (directory := plan.folder / "checkpoints") != checkpoint_dir:
+    interruption.settle(f"stopped and saved after iteration {done} of {config.num_iterations}; continue with --resume")
+    for i, plan in todo.items():
+        if (directory := plan.folder / "checkpoints") != program.checkpoint_dir:
             runner.save(results[i], directory)
-    return results, steps / seconds if seconds else None
+    return results, recorder.env_steps_per_second
 
 
-def _evaluate(carried_out: Sequence[tuple[Plan, "Result"]], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:
+def _evaluate(setup: Setup, results: Sequence["Result"], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:
     """Evaluations of all runs, in one program, and that of the random policy."""
     import jax
 
     from ccil_jax.acting import evaluation
     from ccil_jax.training import runner
 
-    first, result = carried_out[0]
-    settings: Any = {"num_episodes": first.eval_episodes, "seed": first.evaluation_seed}
-    # Each seed of a run plays episodes of its own, and the same ones whatever is evaluated beside the run.
-    draws = list(range(first.num_seeds)) * len(carried_out)
-    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for _, result in carried_out])
-    together = evaluation.evaluate(result.config, agents, env, draws=draws, **settings)
-    own = runner.columns(len(carried_out), first.num_seeds)
+    settings: Any = {"num_episodes": setup.eval_episodes, "seed": setup.evaluation_seed}
+    # Each seed of a run plays episodes of its own. They are the same whatever is evaluated beside the run.
+    draws = list(range(setup.num_seeds)) * len(results)
+    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for result in results])
+    together = evaluation.evaluate(results[0].config, agents, env, draws=draws, **settings)
+    own = runner.columns(len(results), setup.num_seeds)
     evaluations = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], together) for rows in own]
     return evaluations, evaluation.random_policy(env, **settings)
 
 
-def _facts(plan: Plan, env: Any) -> dict[str, Any]:
+def _facts(plan: RunPlan, env: Any) -> dict[str, Any]:
+    """What config.json says besides the hyperparameters."""
     import jax
 
-    demonstrations = None
-    if plan.demonstrations is not None and plan.demonstrations_path is not None:
+    setup, demonstrations = plan.setup, None
+    if setup.demonstrations_path is not None:
         demonstrations = {
-            "file": str(plan.demonstrations_path.resolve()),
-            "sha256": file_sha256(plan.demonstrations_path),
-            "num_episodes": plan.demonstrations.num_episodes,
+            "file": str(setup.demonstrations_path.resolve()),
+            "sha256": file_sha256(setup.demonstrations_path),
+            "num_episodes": setup.num_demonstrations,
         }
     device = jax.devices()[0]
     return {
-        "task": plan.task,
+        "task": setup.task,
         "physics": env.physics_name,
-        "env_options": plan.env_options,
+        "env_options": setup.env_options,
         "preset": plan.preset,
         "command": plan.command,
-        "seed": plan.seed,
-        "one_by_one": plan.one_by_one,
-        "num_seeds": plan.num_seeds,
-        "eval_episodes": plan.eval_episodes,
+        "seed": setup.seed,
+        "one_by_one": setup.one_by_one,
+        "num_seeds": setup.num_seeds,
+        "eval_episodes": setup.eval_episodes,
         "demonstrations": demonstrations,
-        **summary.expert_levels(plan.demonstrations),
-        "expert_length": plan.demonstrations.mean_episode_length if plan.demonstrations else None,
+        **summary.expert_levels(setup.demonstrations),
+        "expert_length": setup.demonstrations.mean_episode_length if setup.demonstrations else None,
         "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
     }
 
 
 def _finish(
-    plan: Plan,
+    plan: RunPlan,
     result: "Result",
     rate: float | None,
     num_runs: int,
@@ -267,18 +260,21 @@ def _finish(
 
     The summary is the last file to be written: its presence says that the run folder is complete.
     """
-    from experiments.runs import figures  # imports matplotlib: no argument error should wait for it
+    from experiments.runs import figures  # imports matplotlib, which is slow
 
-    reference = summary.make_reference(summary.expert_levels(plan.demonstrations), random, plan.config.prescribed_limit)
+    setup = plan.setup
+    reference = summary.make_reference(
+        summary.expert_levels(setup.demonstrations), random, plan.config.prescribed_limit
+    )
     metrics = run_folder.read_metrics(plan.folder)
     rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
     content = {
-        "task": plan.task,
+        "task": setup.task,
         "method": plan.config.method,
-        "num_seeds": plan.num_seeds,
+        "num_seeds": setup.num_seeds,
         **dataclasses.asdict(reference),
-        "evaluation": {"simulator": "ours", "num_episodes": plan.eval_episodes, "deterministic": False},
+        "evaluation": {"simulator": "ours", "num_episodes": setup.eval_episodes, "deterministic": False},
         "per_seed": rows,
         "aggregate": aggregate,
         "violation_beyond_error": summary.mean_violation_beyond_error(rows, reference),  # of the mean over seeds
@@ -290,7 +286,7 @@ def _finish(
     }
     figure = figures.draw_run(plan.folder)
     run_folder.write_json(plan.folder / "summary.json", content)
-    title = f"{plan.config.method} on {plan.task}, {plan.eval_episodes} evaluation episodes per seed"
+    title = f"{plan.config.method} on {setup.task}, {setup.eval_episodes} evaluation episodes per seed"
     summary.print_table(title, rows, aggregate, reference)
     print(f"figure  {figure}\nrun     {plan.folder}")
     return content

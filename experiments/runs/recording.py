@@ -7,9 +7,9 @@ from typing import Any
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from experiments.cli.command_line import UsageError
+from experiments.cli.tables import number, show, with_error
 from experiments.runs import run_folder
 from experiments.runs.run_folder import Run
-from experiments.runs.summary import number, show, with_error
 
 _SCORES = ("episode_return", "episode_cost", "episode_length")
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.demonstrations.trajectories import Demonstrations, standard_error
+from experiments.cli.tables import BEYOND_ERROR, marked, number, show, with_error
 from experiments.runs.intervals import MIN_SEEDS, bootstrap_interval
 
 SCORES = (
@@ -19,7 +20,6 @@ SCORES = (
     "cost_rate",
     "episode_length",
 )
-BEYOND_ERROR = "beyond the demonstrations' error"  # what the mark of a violation says
 NO_INTERVAL = f"no interval below {MIN_SEEDS} seeds"
 _MAX_RELATIVE_VIOLATION = 5.0  # caps the penalty: one diverged seed must not decide a mean
 
@@ -185,38 +185,6 @@ def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, 
     notes = ["+-: standard error over episodes", f"*: {BEYOND_ERROR}" if is_marked else ""]
     table.caption = "; ".join(filter(None, [*notes, f"-: {NO_INTERVAL}" if len(rows) < MIN_SEEDS else ""]))
     show(table)
-
-
-def show(table: Any) -> None:
-    """Prints a rich table, in a pipe or log at the width that it needs; its texts are shown as they are, no markup."""
-    from rich.console import Console
-
-    console = Console(markup=False, emoji=False)
-    if not console.is_terminal:
-        console.width = 160
-    console.print(table)
-
-
-def marked(text: str, beyond_error: bool | None) -> str:
-    """A violation with the mark that it deserves."""
-    return f"{text} *" if beyond_error else text
-
-
-def with_error(mean: float | None, error: float | None) -> str:
-    """A mean with its standard error, such as `22.00 +- 1.20`; a dash for what is unknown."""
-    return "-" if mean is None else f"{number(mean)} +- {number(error)}"
-
-
-def bounds(low: float | None, high: float | None) -> str:
-    """An interval in brackets, a dash in them where there is none."""
-    return "[-]" if low is None or high is None else f"[{number(low)}, {number(high)}]"
-
-
-def number(value: float | None) -> str:
-    """Three or four significant digits, never in exponent form; a dash for None and NaN."""
-    if value is None or np.isnan(value):
-        return "-"
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.1f}" if abs(value) >= 100 else f"{value:.2f}"
 
 
 def _interval(entry: Mapping[str, float | None] | None) -> str:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.config import Config
+from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number, show
 from experiments.runs import run_folder
 from experiments.runs.intervals import bootstrap_interval
-from experiments.runs.summary import BEYOND_ERROR, NO_INTERVAL, bounds, marked, number, show
+from experiments.runs.summary import NO_INTERVAL
 from experiments.sweeps.variants import Variant
 
 SCORES = ("episode_return", "episode_cost", "recovered_return", "relative_cost_violation")
@@ -22,8 +23,8 @@ Row = dict[str, Any]
 def row(variant: Variant) -> Row:
     """What a finished variant came to: scores with intervals over seeds, its multiplier, its speed."""
     summary = run_folder.read_json(variant.plan.folder / "summary.json")
-    content: Row = {"variant": variant.name, "task": variant.plan.task, "method": variant.plan.config.method}
-    content |= {"num_seeds": variant.plan.num_seeds, "env_steps": summary["env_steps"]}
+    content: Row = {"variant": variant.name, "task": variant.plan.setup.task, "method": variant.plan.config.method}
+    content |= {"num_seeds": variant.plan.setup.num_seeds, "env_steps": summary["env_steps"]}
     for name in SCORES:
         values = [seed[name] for seed in summary["per_seed"]]
         interval = None if None in values else bootstrap_interval([np.array(values)])

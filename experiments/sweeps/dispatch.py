@@ -12,7 +12,7 @@ from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
 from experiments.sweeps import backends, variants
-from experiments.sweeps.variants import Program, Variant
+from experiments.sweeps.variants import Job, Variant
 
 _INTERRUPTED = 130  # exit status after Ctrl-C, as of shells
 
@@ -70,17 +70,17 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
         _check_choices(out / record, choices)
     for variant in chosen:
         variants.check_unchanged(variant)
-    all_programs = variants.group(chosen, out)
-    # A program keeps its variants, so that what is missing goes on from the checkpoints that hold them all.
-    programs = [program for program in all_programs if not all(variant.finished for variant in program.variants)]
-    num_runs = sum(variant.plan.num_seeds for variant in chosen)
-    done = f", {len(programs)} of them unfinished" if arguments.resume else ""
-    print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_programs)} programs{done}", flush=True)
+    all_jobs = variants.group(chosen, out)
+    # A job keeps its finished variants too: what is missing goes on from checkpoints that hold all of them.
+    jobs = [job for job in all_jobs if not all(variant.finished for variant in job.variants)]
+    num_runs = sum(variant.plan.setup.num_seeds for variant in chosen)
+    done = f", {len(jobs)} of them unfinished" if arguments.resume else ""
+    print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_jobs)} programs{done}", flush=True)
     facts = {"command": command_line.command(), "versions": versions()}
     run_folder.write_json(out / record, {**facts, "git_commit": run_folder.git_commit(), "choices": choices})
-    for program in programs:
-        variants.write_program(program)
-    return _wait(programs, arguments)
+    for job in jobs:
+        variants.write_job(job)
+    return _wait(jobs, arguments)
 
 
 def _check_choices(path: Path, choices: Mapping[str, Any]) -> None:
@@ -92,9 +92,9 @@ def _check_choices(path: Path, choices: Mapping[str, Any]) -> None:
             )
 
 
-def _wait(programs: Sequence[Program], arguments: argparse.Namespace) -> int:
+def _wait(jobs: Sequence[Job], arguments: argparse.Namespace) -> int:
     start, num_failed = time.monotonic(), 0
-    by_folder = {program.folder: program for program in programs}
+    by_folder = {job.folder: job for job in jobs}
     outcomes = backends.launch(
         arguments.launcher, list(by_folder), arguments.workers, arguments.out / "slurm", dict(arguments.slurm)
     )
@@ -102,7 +102,7 @@ def _wait(programs: Sequence[Program], arguments: argparse.Namespace) -> int:
         for i, (folder, failure) in enumerate(outcomes, 1):
             names = " ".join(variant.name for variant in by_folder[folder].variants)
             state = "done" if failure is None else f"FAILED ({failure})"
-            print(f"[{i}/{len(programs)}] {time.monotonic() - start:,.0f} s: {names}: {state}", flush=True)
+            print(f"[{i}/{len(jobs)}] {time.monotonic() - start:,.0f} s: {names}: {state}", flush=True)
             num_failed += failure is not None
     except KeyboardInterrupt:
         print("stopped; continue with --resume", file=sys.stderr)

@@ -14,13 +14,12 @@ from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ccil_jax.config import Config, field_names, relevant
+from ccil_jax.config import relevant
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
 from ccil_jax.training.filesystem import file_sha256
-from experiments import train
 from experiments.cli.command_line import Parser, UsageError
-from experiments.runs import run_folder
-from experiments.runs.execution import Plan
+from experiments.runs import plans, run_folder
+from experiments.runs.plans import RunPlan, static_values
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,7 +28,7 @@ class Variant:
 
     name: str  # and its folder's
     options: tuple[str, ...]  # of `train`
-    plan: Plan
+    plan: RunPlan
     alone: bool = False  # wants a program of its own, as its speed is of interest
 
     @property
@@ -39,8 +38,8 @@ class Variant:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Program:
-    """Variants that are trained together."""
+class Job:
+    """Variants that one process trains together, in one compiled program."""
 
     folder: Path
     variants: tuple[Variant, ...]
@@ -77,10 +76,10 @@ def _variant(
     name: str, given: Sequence[str], out: Path, load: Callable[[Path], Demonstrations], *, alone: bool = False
 ) -> Variant:
     parser = _OptionParser("train", "")
-    train.add_options(parser)
+    plans.add_options(parser)
     folder = out / "runs" / name
     resume = (folder / "config.json").is_file()
-    plan = train.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
+    plan = plans.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
     return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
 
 
@@ -92,66 +91,55 @@ def text(value: Any) -> str:
 
 
 def check_unchanged(variant: Variant) -> None:
-    """Raises `UsageError` where the variant's folder holds a run of other choices."""
-    plan = variant.plan
+    """Raises `UsageError` where the variant's folder holds a run that was started with other choices."""
+    plan, setup = variant.plan, variant.plan.setup
     if not plan.resume:
         return
     run = run_folder.read_run(plan.folder)
-    chosen = {**relevant(plan.config), "task": plan.task, "seed": plan.seed, "num_seeds": plan.num_seeds}
-    chosen |= {name: getattr(plan, name) for name in ("eval_episodes", "env_options", "one_by_one")}
+    names = ("task", "seed", "num_seeds", "eval_episodes", "env_options", "one_by_one")
+    chosen = {**relevant(plan.config), **{name: getattr(setup, name) for name in names}}
     saved = {**run.facts, **dataclasses.asdict(run.config)}
     for name, value in chosen.items():
-        if saved.get(name, value) != value:  # an older version may not say
+        if saved.get(name, value) != value:  # a folder of an older version may lack the name
             raise UsageError(f"--resume: {plan.folder} has {name} {saved[name]}, not {value}; choose another --out")
     demos = run.facts["demonstrations"]
-    if demos and plan.demonstrations_path and file_sha256(plan.demonstrations_path) != demos["sha256"]:
-        raise UsageError(f"--resume: {plan.folder} began with other demonstrations than {plan.demonstrations_path}")
+    if demos and setup.demonstrations_path and file_sha256(setup.demonstrations_path) != demos["sha256"]:
+        raise UsageError(f"--resume: {plan.folder} began with other demonstrations than {setup.demonstrations_path}")
 
 
 def run_of(variant: Variant) -> Hashable:
-    """What a variant trains, whatever it is called: two that are equal would train the same."""
-    return _shared(variant.plan), variant.plan.config
+    """What a variant trains, apart from its name and folder: two variants with equal values would train the same."""
+    return variant.plan.setup, variant.plan.config
 
 
-def group(variants: Iterable[Variant], out: Path) -> list[Program]:
-    """The programs of these variants, in the order of their first ones."""
-    groups: dict[Any, list[Variant]] = {}
+def group(variants: Iterable[Variant], out: Path) -> list[Job]:
+    """The jobs that train these variants, in the order of their first variants."""
+    groups: dict[Hashable, list[Variant]] = {}
     for variant in variants:
-        groups.setdefault((_shared(variant.plan), variant.name if variant.alone else ""), []).append(variant)
-    return [_program(members, out) for members in groups.values()]
+        program = variant.plan.setup, static_values(variant.plan.config)
+        groups.setdefault((program, variant.name if variant.alone else ""), []).append(variant)
+    return [_job(members, out) for members in groups.values()]
 
 
-def static_part(config: Config) -> tuple[Any, ...]:
-    """The values that shape a program."""
-    return tuple(getattr(config, name) for name in field_names(traced=False))
-
-
-def _shared(plan: Plan) -> tuple[Any, ...]:
-    """What the plans of one program have in common."""
-    expert = (plan.demonstrations_path, plan.demonstrations.num_episodes if plan.demonstrations else 0)
-    names = ("task", "physics", "num_seeds", "seed", "one_by_one", "eval_episodes")
-    return static_part(plan.config), str(plan.env_options), expert, *(getattr(plan, name) for name in names)
-
-
-def _program(variants: Sequence[Variant], out: Path) -> Program:
-    # Named after its contents: with other variants it is another program, whose checkpoints would not fit.
+def _job(variants: Sequence[Variant], out: Path) -> Job:
+    # The folder is named after the variants: a job with other variants is another program, which could not go on from
+    # the checkpoints of this one.
     digest = hashlib.sha256(json.dumps([[v.name, v.options] for v in variants]).encode()).hexdigest()[:10]
-    plan = variants[0].plan
-    folder = out / "programs" / f"{plan.task}_{plan.config.method}_{digest}"
-    return Program(folder=folder, variants=tuple(variants))
+    ((task, method),) = {(v.plan.setup.task, v.plan.config.method) for v in variants}
+    return Job(folder=out / "programs" / f"{task}_{method}_{digest}", variants=tuple(variants))
 
 
-def write_program(program: Program) -> None:
-    """Makes the folders of a program and of its runs, and leaves program.json for its worker."""
-    program.folder.mkdir(parents=True, exist_ok=True)
-    for variant in program.variants:
+def write_job(job: Job) -> None:
+    """Makes the folders of a job and of its runs, and leaves program.json for its worker."""
+    job.folder.mkdir(parents=True, exist_ok=True)
+    for variant in job.variants:
         variant.plan.folder.mkdir(parents=True, exist_ok=True)
-    content = {"variants": [{"name": v.name, "options": v.options} for v in program.variants]}
-    run_folder.write_json(program.folder / "program.json", content)
+    content = {"variants": [{"name": v.name, "options": v.options} for v in job.variants]}
+    run_folder.write_json(job.folder / "program.json", content)
 
 
-def read_program(folder: Path) -> Program:
-    """The program that `write_program` left. Raises `UsageError` if it is missing or damaged."""
+def read_job(folder: Path) -> Job:
+    """The job that `write_job` left. Raises `UsageError` if it is missing or damaged."""
     content = run_folder.read_json(folder / "program.json")
     out = folder.parent.parent
     try:
@@ -159,4 +147,4 @@ def read_program(folder: Path) -> Program:
     except (KeyError, TypeError):
         raise UsageError(f"{folder}/program.json: damaged; repeat the sweep in another folder") from None
     load = functools.cache(load_demonstrations)
-    return Program(folder=folder, variants=tuple(_variant(name, given, out, load) for name, given in pairs))
+    return Job(folder=folder, variants=tuple(_variant(name, given, out, load) for name, given in pairs))

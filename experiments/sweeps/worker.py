@@ -12,6 +12,7 @@ from pathlib import Path
 from experiments.cli import command_line, interruption
 from experiments.cli.command_line import Parser
 from experiments.runs.execution import execute_together
+from experiments.runs.plans import ProgramPlan
 from experiments.sweeps import variants
 
 
@@ -30,12 +31,16 @@ def run(arguments: argparse.Namespace) -> None:
         interruption.stop_at_eof()
     if arguments.cpus and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, arguments.cpus)
-    program = variants.read_program(arguments.program)
-    finished = {variant.plan.folder for variant in program.variants if variant.finished}
-    if len(finished) == len(program.variants):
-        return  # a worker before this one died when everything was done
-    plans = [variant.plan for variant in program.variants]
-    execute_together(plans, program.folder / "checkpoints", resume=True, finished=finished)
+    job = variants.read_job(arguments.program)
+    if all(variant.finished for variant in job.variants):
+        return  # the worker before this one died after everything was done
+    program = ProgramPlan(
+        runs=tuple(variant.plan for variant in job.variants),
+        checkpoint_dir=job.folder / "checkpoints",
+        resume=True,
+        finished=frozenset(variant.plan.folder for variant in job.variants if variant.finished),
+    )
+    execute_together(program)
 
 
 def _cpus(text: str) -> list[int]:

@@ -1,5 +1,9 @@
-"""Progress of a training run: a live bar on a terminal, plain lines elsewhere (logs, pipes)."""
+"""Progress of a training: a live bar on a terminal, plain lines elsewhere (in log files and pipes).
 
+Everything is written to standard error. Importing this module imports neither JAX nor rich.
+"""
+
+import math
 import sys
 import time
 from types import TracebackType
@@ -7,20 +11,29 @@ from typing import Any, Self
 
 import numpy as np
 
-from experiments.runs.intervals import known_mean
-from experiments.runs.summary import number
-
 _SECONDS_BETWEEN_LINES = 10.0
 
 
 class Display:
-    """Shows return, cost against its limit, multiplier, speed and time left; use it as a context manager."""
+    """Shows the return, the cost beside its limit, the multiplier, the speed and the time left.
+
+    Use it as a context manager, and hand `update` to `runner.train` as `on_progress`.
+    """
 
     def __init__(self, title: str, num_iterations: int, cost_limit: float | None, *, has_multiplier: bool) -> None:
+        """Prepares the display; the bar appears when the context begins.
+
+        Args:
+            title: stands at the beginning of the bar or of each line.
+            num_iterations: of the whole training (`Config.num_iterations`).
+            cost_limit: is shown beside the cost (`Config.cost_limit`); None where there is none, or where the runs that
+                are trained together have different ones.
+            has_multiplier: whether there is a multiplier to show (`Config.has_multiplier`).
+        """
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        # Names of folders are shown as they are: no markup, no emoji.
+        # A name of a folder may look like rich's markup or like the name of an emoji. It is shown as it is.
         self._console = Console(file=sys.stderr, soft_wrap=True, markup=False, emoji=False)
         self._cost_limit = cost_limit
         self._has_multiplier = has_multiplier
@@ -44,7 +57,7 @@ class Display:
         self._console.print(text, highlight=False)
 
     def update(self, progress: Any) -> None:
-        """Shows a `ccil_jax.training.runner.Progress`."""
+        """Shows the state after a chunk of iterations, a `ccil_jax.training.runner.Progress`."""
         now = time.monotonic()
         if self._first_iteration is None:
             self._first_iteration, self._started = progress.iteration, now
@@ -58,7 +71,7 @@ class Display:
             self.message(f"{self._title} {progress.iteration}/{progress.num_iterations}  {status}{left}")
 
     def _status(self, progress: Any) -> str:
-        latest = {name: float(known_mean(np.asarray(rows[-1]), axis=0)) for name, rows in progress.metrics.items()}
+        latest = {name: _known_mean(rows[-1]) for name, rows in progress.metrics.items()}
         limit = "" if self._cost_limit is None else f" / {number(self._cost_limit)}"
         if "episode_return" not in latest:  # behaviour cloning: it does not act while it learns
             return f"loss {number(latest['loss'])}  held out {number(latest['held_out_loss'])}"
@@ -85,3 +98,16 @@ class Display:
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
+
+
+def _known_mean(row: np.ndarray) -> float:
+    """Mean over the runs [num_runs] whose value is known; NaN where none is."""
+    known = row[~np.isnan(row)]
+    return float(known.mean()) if known.size else math.nan
+
+
+def number(value: float | None) -> str:
+    """Three or four significant digits, never in exponent form; a dash for None and NaN."""
+    if value is None or math.isnan(value):
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.1f}" if abs(value) >= 100 else f"{value:.2f}"

@@ -1,0 +1,34 @@
+"""Tables in the terminal, and how their cells write numbers."""
+
+from typing import Any
+
+from ccil_jax.training.progress import number
+
+__all__ = ["BEYOND_ERROR", "bounds", "marked", "number", "show", "with_error"]
+
+BEYOND_ERROR = "beyond the demonstrations' error"  # what the mark of a violation says
+
+
+def show(table: Any) -> None:
+    """Prints a rich table, in a pipe or log at the width that it needs; its texts are shown as they are, no markup."""
+    from rich.console import Console
+
+    console = Console(markup=False, emoji=False)
+    if not console.is_terminal:
+        console.width = 160
+    console.print(table)
+
+
+def marked(text: str, beyond_error: bool | None) -> str:
+    """A violation with the mark that it deserves."""
+    return f"{text} *" if beyond_error else text
+
+
+def with_error(mean: float | None, error: float | None) -> str:
+    """A mean with its standard error, such as `22.00 +- 1.20`; a dash for what is unknown."""
+    return "-" if mean is None else f"{number(mean)} +- {number(error)}"
+
+
+def bounds(low: float | None, high: float | None) -> str:
+    """An interval in brackets, a dash in them where there is none."""
+    return "[-]" if low is None or high is None else f"[{number(low)}, {number(high)}]"
