@@ -264,7 +264,7 @@ def with_limit_of(config: Config, mean_episode_cost: float) -> Config:
     """
     if config.row.limit != "demonstrations":
         return config
-    if config.cost_limit not in (None, mean_episode_cost):
+    if _is_traced(config.cost_limit) or config.cost_limit not in (None, mean_episode_cost):
         raise ConfigError(_limit_by_hand(config))
     return config.replace(cost_limit=mean_episode_cost)
 
@@ -316,6 +316,14 @@ def check_types(config: Config) -> None:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
 
 
+_ANY = 0.5  # within the range of every traced field
+
+
+def _is_traced(value: Any) -> bool:
+    """Whether this is a number of JAX, inside a program perhaps, where nobody knows it yet."""
+    return not isinstance(value, numbers.Number) and getattr(value, "shape", None) == () and hasattr(value, "aval")
+
+
 def _is_number(value: Any) -> bool:
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         return False
@@ -335,8 +343,11 @@ def validate(config: Config) -> None:
     """Raises `ConfigError` for a combination that cannot run, before anything is compiled.
 
     A field that makes no difference must have its default: any other value was given by hand, in vain. A resolved
-    limit of the demonstrations' is let through; `with_limit_of` compares it with them.
+    limit of the demonstrations' is let through; `with_limit_of` compares it with them. Numbers of JAX, as traced fields
+    have them inside a program, are taken on trust.
     """
+    traced = (name for name in field_names(traced=True) if _is_traced(getattr(config, name)))
+    config = config.replace(**dict.fromkeys(traced, _ANY))
     check_types(config)
     resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
     check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))
