@@ -8,9 +8,10 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 from ccil_jax.errors import ConfigError
+from ccil_jax.fields import Fields
 from ccil_jax.methods import Method, find_method
 from ccil_jax.presets import PRESETS
 from ccil_jax.uses import (
@@ -160,7 +161,7 @@ class Config:
     )
 
     @classmethod
-    def from_preset(cls, preset: str, **changes: Any) -> "Config":
+    def from_preset(cls, preset: str, **changes: Unpack[Fields]) -> "Config":
         """The preset with `changes` on top. What it says of fields that the method does not use is left out.
 
         Raises:
