@@ -12,8 +12,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # gradient steps the discriminator separates the classes completely where that is easy (HalfCheetah), and its reward
     # no longer tells better from worse. So it has a gradient penalty.
     "paper": {},
-    # The best of what docs/ablations.md measures at this length: CVAG decides for each episode, and the multiplier moves
-    # in proportion to the gap (CCIL: 74 % of the return instead of 58 on HalfCheetah, 98 instead of 66 on Swimmer).
+    # The best of what docs/ablations.md measures at this length: CVAG decides for each episode, and the multiplier
+    # moves in proportion to the gap (CCIL: 74 % of the return instead of 58 on HalfCheetah, 98 instead of 66 on
+    # Swimmer).
     "default": {
         "env_steps": 1_500_000,
         "gate": "episode",
@@ -29,8 +30,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "discriminator_minibatch_size": 2000,
         "discriminator_regularizer": "none",
     },
-    # What the authors' code does: Adam on xi for both steps of the multiplier, CVAG's decision for each episode, a value
-    # of 0 beyond a time limit. That code counts the steps of one batch in three, so its 1e7 steps are 3e7 here.
+    # What the authors' code does: Adam on xi for both steps of the multiplier, CVAG's decision for each episode, a
+    # value of 0 beyond a time limit. That code counts the steps of one batch in three, so its 1e7 steps are 3e7 here.
     "authors": {
         "meta_gradient": "direct",
         "gate": "episode",
@@ -40,10 +41,10 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     # No discriminator has to follow the policy, so an iteration has one larger batch and a wider trust region.
     "expert": {"env_steps": 2_000_000, "batch_size": 4000, "generator_steps": 1, "max_kl": 0.02, "gamma": 0.99},
-    # Costs are rare in these tasks (some 25 visits of a hazard in 20,000 steps), so their gradient is mostly noise. Hence
-    # large batches, small steps, and a multiplier that moves in proportion to the gap: Adam's steps have the same size
-    # near the limit and overshoot it. A small lambda of the cost's advantage estimation relies on the critic, whose
-    # errors are large here: with 0.8 the cost on PointGoal1 did not fall at all.
+    # Costs are rare in these tasks (some 25 visits of a hazard in 20,000 steps), so their gradient is mostly noise.
+    # Hence large batches, small steps, and a multiplier that moves in proportion to the gap: Adam's steps have the same
+    # size near the limit and overshoot it. A small lambda of the cost's advantage estimation relies on the critic,
+    # whose errors are large here: with 0.8 the cost on PointGoal1 did not fall at all.
     "safety_gym_expert": {
         "env_steps": 8_000_000,
         "num_envs": 32,

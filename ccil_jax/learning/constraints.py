@@ -20,8 +20,8 @@ from ccil_jax.learning.optimizers import adam
 from ccil_jax.methods import function_of
 from ccil_jax.types import Metrics, PyTree
 
-# Within the limit Adam lowers xi by about its learning rate in every update, without end. A multiplier softplus(xi) that
-# has nearly vanished would need as many updates to matter again, so it stays at least this large.
+# Within the limit Adam lowers xi by about its learning rate in every update, without end. A multiplier softplus(xi)
+# that has nearly vanished would need as many updates to matter again, so it stays at least this large.
 SMALLEST_SOFTPLUS_MULTIPLIER = 1e-3
 
 
@@ -140,7 +140,7 @@ def pid(config: Config) -> Constraint:
 
 
 def trust_region_optimal(config: Config) -> Constraint:
-    """The multiplier that is optimal for each policy step by itself, in closed form (constrained policy optimisation)."""
+    """The multiplier that is optimal for each single policy step, in closed form (constrained policy optimisation)."""
     return Constraint(combine=lambda multiplier, step_gap, gram: optimal_weights(gram, step_gap, config.max_kl))
 
 
