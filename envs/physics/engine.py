@@ -22,6 +22,7 @@ POST_CONSTRAINT = frozenset({"cacc", "cfrc_int", "cfrc_ext"})
 STATE = -1  # as the source of a `Copy`: the state, not a derived array
 
 _INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,57 +67,28 @@ class Engine:
     ) -> None:
         self._sizes = row_size, output_size
         facts = (num_threads, num_substeps, last_stage, num_state, row_size, output_size, *derived, *copies)
-        serialized = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-        mujoco.mj_saveModel(model, None, serialized)
-        digest = hashlib.sha256(repr(facts).encode() + serialized.tobytes()).digest()
-        self._key = int.from_bytes(digest[:7], "little")
+        self._key = _digest(model, facts)
         with _lock_of_engines:
             if self._key in _known:
                 return
             model = copy.copy(model)
-            names = [ctypes.create_string_buffer(name.encode()) for name in derived]
-            arrays = np.array(
-                [
-                    (ctypes.addressof(names[i]), *where, derived[i] in POST_CONSTRAINT)
-                    for i, where in enumerate(_locate(model, derived))
-                ],
-                np.int64,
-            )
-            copy_table = np.array([dataclasses.astuple(one) for one in copies], np.int64)
-            pool = np.zeros((foreign.POOL_SIZE, foreign.DERIVED + len(derived)), np.int64)
-            engine = np.zeros(foreign.ENGINE_SIZE, np.int64)
-            ctypes.CDLL(None).pthread_mutex_init(ctypes.c_void_p(engine.ctypes.data), None)
-            for field, value in {
-                foreign.MODEL: model._address,
+            located, tables = _tables_of(model, derived, copies)
+            fields = {
                 foreign.THREADS: num_threads,
                 foreign.NUM_STATE: num_state,
                 foreign.ROW: row_size,
                 foreign.OUTPUT: output_size,
-                foreign.NUM_CTRL: model.nu,
-                foreign.NUM_MOCAP: model.nmocap,
                 foreign.NUM_SUBSTEPS: num_substeps,
                 foreign.LAST_STAGE: last_stage,
-                foreign.POST: bool(POST_CONSTRAINT.intersection(derived)),
-                foreign.CTRL: _column(model, mujoco.mjtState.mjSTATE_CTRL),
-                foreign.QUAT: _column(model, mujoco.mjtState.mjSTATE_MOCAP_QUAT),
-                foreign.POS: _column(model, mujoco.mjtState.mjSTATE_MOCAP_POS),
-                foreign.NUM_DERIVED: len(derived),
-                foreign.ARRAYS: arrays.ctypes.data,
-                foreign.NUM_COPIES: len(copies),
-                foreign.COPIES: copy_table.ctypes.data,
-                foreign.POOL: pool.ctypes.data,
-                foreign.ADVANCE: foreign.advance_one.address,
-                foreign.ACC: int(mujoco.mjtStage.mjSTAGE_ACC),
-                foreign.NUM_WARNINGS: int(mujoco.mjtWarning.mjNWARNING),
-            }.items():
+                **_numbers_of(model),
+                **located,
+            }
+            engine = np.zeros(foreign.ENGINE_SIZE, np.int64)
+            ctypes.CDLL(None).pthread_mutex_init(ctypes.c_void_p(engine.ctypes.data), None)
+            for field, value in fields.items():
                 engine[field] = value
-            reasons = (
-                mujoco.mjtWarning.mjWARN_BADQPOS,
-                mujoco.mjtWarning.mjWARN_BADQVEL,
-                mujoco.mjtWarning.mjWARN_BADQACC,
-            )
-            engine[foreign.DIVERGED :] = [int(reason) for reason in reasons]
-            _enter(self._key, engine, (model, names, arrays, copy_table, pool))
+            engine[foreign.DIVERGED :] = [int(reason) for reason in _DIVERGED]
+            _enter(self._key, engine, (model, tables))
 
     def step(self, bits: jax.Array, ctrl: jax.Array, *poses: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Advances one control step; vmapped, all simulations together.
@@ -177,6 +149,54 @@ class Engine:
 
 _lock_of_engines = threading.Lock()
 _known: dict[int, tuple[np.ndarray, Any]] = {}  # every engine of this process, and what it points to
+
+
+def _digest(model: mujoco.MjModel, facts: Sequence[Any]) -> int:
+    """A number by which an engine is known: the same for the same model and facts, in every process."""
+    serialized = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, serialized)
+    digest = hashlib.sha256(repr(facts).encode() + serialized.tobytes()).digest()
+    return int.from_bytes(digest[:7], "little")
+
+
+def _numbers_of(model: mujoco.MjModel) -> dict[int, int]:
+    """Fields of an engine that follow from the model and from MuJoCo."""
+    return {
+        foreign.MODEL: model._address,
+        foreign.NUM_CTRL: model.nu,
+        foreign.NUM_MOCAP: model.nmocap,
+        foreign.CTRL: _column(model, mujoco.mjtState.mjSTATE_CTRL),
+        foreign.QUAT: _column(model, mujoco.mjtState.mjSTATE_MOCAP_QUAT),
+        foreign.POS: _column(model, mujoco.mjtState.mjSTATE_MOCAP_POS),
+        foreign.ADVANCE: foreign.advance_one.address,
+        foreign.ACC: int(mujoco.mjtStage.mjSTAGE_ACC),
+        foreign.NUM_WARNINGS: int(mujoco.mjtWarning.mjNWARNING),
+    }
+
+
+def _tables_of(
+    model: mujoco.MjModel, derived: Sequence[str], copies: Sequence[Copy]
+) -> tuple[dict[int, int], Sequence[Any]]:
+    """Fields of an engine that say how long its tables are and where they lie, and the tables, which must live on."""
+    names = [ctypes.create_string_buffer(name.encode()) for name in derived]
+    arrays = np.array(
+        [
+            (ctypes.addressof(names[i]), *where, derived[i] in POST_CONSTRAINT)
+            for i, where in enumerate(_locate(model, derived))
+        ],
+        np.int64,
+    )
+    copy_table = np.array([dataclasses.astuple(one) for one in copies], np.int64)
+    pool = np.zeros((foreign.POOL_SIZE, foreign.DERIVED + len(derived)), np.int64)
+    fields = {
+        foreign.POST: bool(POST_CONSTRAINT.intersection(derived)),
+        foreign.NUM_DERIVED: len(derived),
+        foreign.ARRAYS: arrays.ctypes.data,
+        foreign.NUM_COPIES: len(copies),
+        foreign.COPIES: copy_table.ctypes.data,
+        foreign.POOL: pool.ctypes.data,
+    }
+    return fields, (names, arrays, copy_table, pool)
 
 
 def _enter(key: int, engine: np.ndarray, kept: Any) -> None:
