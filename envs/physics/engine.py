@@ -27,28 +27,31 @@ _DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL,
 
 @dataclasses.dataclass(frozen=True)
 class Copy:
-    """One output of a call: columns of the state, or a derived array, and where they go."""
+    """Numbers that a call copies: some columns of the state or a whole derived array, and where they are written."""
 
-    source: int  # number of the derived array, or `STATE`
-    start: int  # first column, where it is the state
-    size: int
-    into_row: bool  # of the engine's own row, or of the outputs
-    target: int  # first column there
-    change: int = -1  # if not negative, what is written is the difference to the old row from this column on
+    source: int  # index of the derived array, or `STATE`
+    start: int  # the first column that is copied, if the source is the state
+    size: int  # how many numbers
+    into_row: bool  # true: written into the engine's own row; false: into the outputs
+    target: int  # the first column that is written there
+    change: int = -1  # if not negative: the old row, from this column on, is subtracted from what is written
 
 
 class Engine:
-    """Steps any number of simulations of one model; in a jitted program or, on an accelerator's host, called by it.
+    """Steps any number of simulations of one model, inside a jitted program.
+
+    On a CPU the program calls C directly. A program on an accelerator calls back to its host, which does the same.
+    Between two calls a simulation is a *row* of float64 numbers: the state, then the derived arrays that are tracked.
 
     Args:
-        model: copied.
-        num_threads: of one call.
+        model: the compiled model; it is copied.
+        num_threads: threads of one call.
         num_substeps: engine steps per call of `step`.
-        last_stage: the `mjtStage` up to which the forward pass is carried out after them; 0 for none.
-        num_state: float64 columns of a row that are the state: `mjtState` components up to the warm start.
-        row_size: float64 columns of a row, derived arrays behind the state included.
+        last_stage: after the substeps the forward pass is carried out up to this `mjtStage`; 0 for no forward pass.
+        num_state: how many columns of a row are the state: the components of `mjtState` up to the warm start.
+        row_size: columns of a row, the state and the tracked arrays together.
         output_size: columns of the outputs.
-        derived: names of `MjData` arrays.
+        derived: names of the `MjData` arrays that copies read.
         copies: what is written where; all other columns are undefined.
     """
 
@@ -94,17 +97,19 @@ class Engine:
         """Advances one control step; vmapped, all simulations together.
 
         Args:
-            bits: [2 row_size] uint32, the row.
+            bits: [2 row_size] uint32, the bits of the row.
             ctrl: [nu].
-            poses: none, or quaternions [4 nmocap] and positions [3 nmocap] or [num_substeps 3 nmocap].
+            poses: of the mocap bodies: nothing where there are none; otherwise the quaternions [4 nmocap], and the
+                positions [3 nmocap], or [num_substeps 3 nmocap] where they differ from substep to substep.
 
         Returns:
-            The new row's bits, and [output_size] outputs; NaN where the simulation diverged or MuJoCo raised an error.
+            The bits of the new row and the outputs [output_size]. Both are NaN where the simulation diverged or MuJoCo
+            raised an error.
         """
         return self._call(foreign.STEP, bits, ctrl, *poses)
 
     def forward(self, bits: jax.Array, ctrl: jax.Array, *poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The forward pass alone, as `step` else."""
+        """Carries out the forward pass alone. Arguments and results are those of `step`."""
         return self._call(foreign.FORWARD, bits, ctrl, *poses)
 
     def _call(self, name: str, bits: jax.Array, *inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -121,7 +126,7 @@ class Engine:
         return jax.pure_callback(host, shapes, *arguments, vmap_method="broadcast_all")
 
     def _on_host(self, forward: bool, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-        """What the foreign functions do, on arrays of the host."""
+        """Does what the foreign functions do, on NumPy arrays of the host."""
         old, ctrl, *poses = [np.ascontiguousarray(x) for x in arguments]
         lead, (row_size, output_size) = old.shape[:-1], self._sizes
         new = np.empty((*lead, 2 * row_size), np.uint32)
@@ -148,7 +153,7 @@ class Engine:
 
 
 _lock_of_engines = threading.Lock()
-_known: dict[int, tuple[np.ndarray, Any]] = {}  # every engine of this process, and what it points to
+_known: dict[int, tuple[np.ndarray, Any]] = {}  # every engine of this process with the objects that it points to
 
 
 def _digest(model: mujoco.MjModel, facts: Sequence[Any]) -> int:
@@ -200,10 +205,12 @@ def _tables_of(
 
 
 def _enter(key: int, engine: np.ndarray, kept: Any) -> None:
-    """Enters an engine into the table. It stays: a compiled program may outlive its environment, and has the key."""
+    """Enters an engine into the table, for good: a compiled program knows its key and may outlive the environment."""
     count = len(_known)
     if count == foreign.TABLE_SIZE:
-        raise RuntimeError(f"{foreign.TABLE_SIZE} different physics in one process; make fewer, they are kept")
+        raise RuntimeError(
+            f"more than {foreign.TABLE_SIZE} different physics in one process; make fewer, as all are kept"
+        )
     _known[key] = engine, kept
     foreign.engines[1 + 2 * count : 3 + 2 * count] = key, engine.ctypes.data
     foreign.engines[0] = count + 1
@@ -211,7 +218,7 @@ def _enter(key: int, engine: np.ndarray, kept: Any) -> None:
 
 @functools.cache
 def _register() -> None:
-    """Tells XLA of the foreign functions."""
+    """Makes the foreign functions known to XLA."""
     for name, function in ((foreign.STEP, foreign.on_step), (foreign.FORWARD, foreign.on_forward)):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function.ctypes), platform="cpu")
 
@@ -222,14 +229,14 @@ def _column(model: mujoco.MjModel, component: mujoco.mjtState) -> int:
 
 
 def _locate(model: mujoco.MjModel, names: Sequence[str]) -> list[tuple[int, int]]:
-    """Where in C's mjData, in words of 8 bytes, the pointers to these arrays stand, and how long the arrays are.
+    """For each array: where in C's mjData the pointer to it is, counted in words of 8 bytes, and the array's length.
 
-    Found by value: the layout is not to be had from Python.
+    Python does not know the layout of that structure. So it is searched for the array's address.
     """
     data = mujoco.MjData(model)
     measure = getattr(ctypes.CDLL(None), "malloc_size" if sys.platform == "darwin" else "malloc_usable_size")
     measure.argtypes, measure.restype = [ctypes.c_void_p], ctypes.c_size_t
     words = np.ctypeslib.as_array((ctypes.c_int64 * (measure(data._address) // 8)).from_address(data._address))
     arrays = [getattr(data, name) for name in names]
-    # Empty arrays before it have the same address.
+    # Empty arrays that come before it have the same address, so the last place is the right one.
     return [(int(np.flatnonzero(words == array.ctypes.data)[-1]), array.size) for array in arrays]
