@@ -184,11 +184,11 @@ def evaluate_run(
     recorded = {**settings, "shared_episodes": arguments.shared_episodes}
     draws = [0] * stored.facts["num_seeds"] if arguments.shared_episodes else None
     if arguments.simulator == "ours":
-        evaluated: Any = evaluation.evaluate(loaded.config, loaded.agent, env, draws=draws, **settings)
+        evaluated: Any = evaluation.evaluate(loaded.config, loaded.actor, env, draws=draws, **settings)
     else:
         contact_cost = stored.facts["env_options"].get("contact_cost", True)
         evaluated = original_simulator.evaluate(
-            loaded.config, loaded.agent, env, draws=draws, contact_cost=contact_cost, **settings
+            loaded.config, loaded.actor, env, draws=draws, contact_cost=contact_cost, **settings
         )
     provenance = run_folder.provenance()
     facts = {
@@ -200,14 +200,14 @@ def evaluate_run(
     }
     for file in arguments.export:
         if file.suffix == ".npz":
-            exporting.export_numpy(file, loaded.config, loaded.agent, env, evaluated, facts)
+            exporting.export_numpy(file, loaded.config, loaded.actor, env, evaluated, facts)
         else:
-            exporting.export_stablehlo(file, loaded.config, loaded.agent, env)
+            exporting.export_stablehlo(file, loaded.config, loaded.actor, env)
         print(f"policies {file}")
     if described:
         demonstrations = recording.record(
             loaded.config,
-            loaded.agent,
+            loaded.actor,
             env,
             num_trajectories=arguments.num_trajectories or _NUM_TRAJECTORIES,
             episode_seed=(arguments.seed + 1) % 2**32,  # other episodes than those that judge the policy

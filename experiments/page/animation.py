@@ -101,7 +101,7 @@ def play_run(run: Run, seed: int, name: str, caption: str) -> str:
 
     env: Any = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
-    policy = policies(run.config, loaded.agent, env)[seed]
+    policy = policies(run.config, loaded.actor, env)[seed]
     if TASKS[env.name].family == "safety_gym":
         image = figures.png(top_down.draw(env, top_down.record(env, policy)))
         caption = f"{html.escape(caption)} From dark to light as time goes by; red: a cost is paid."
