@@ -23,6 +23,7 @@ from experiments.cli import command_line, interruption, options, xla
 from experiments.cli.command_line import Parser, UsageError
 from experiments.cli.tables import show
 from experiments.runs import run_folder
+from experiments.runs.provenance import git_commit
 from experiments.speed import peers
 from experiments.sweeps import backends
 
@@ -154,7 +155,7 @@ def facts_of_machine() -> dict[str, Any]:
     return {
         "command": command_line.command(),
         "versions": versions(),
-        "git_commit": run_folder.git_commit(),
+        "git_commit": git_commit(),
         "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load_average": os.getloadavg(),
     }

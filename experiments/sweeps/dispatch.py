@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.training.versions import versions
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
+from experiments.runs.provenance import provenance
 from experiments.sweeps import backends, variants
 from experiments.sweeps.variants import Job, Variant
 
@@ -76,8 +76,7 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
     num_runs = sum(variant.plan.setup.num_seeds for variant in chosen)
     done = f", {len(jobs)} of them unfinished" if arguments.resume else ""
     print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_jobs)} programs{done}", flush=True)
-    facts = {"command": command_line.command(), "versions": versions()}
-    run_folder.write_json(out / record, {**facts, "git_commit": run_folder.git_commit(), "choices": choices})
+    run_folder.write_json(out / record, {**provenance(), "choices": choices})
     for job in jobs:
         variants.write_job(job)
     return _wait(jobs, arguments)
