@@ -23,6 +23,7 @@ from experiments.page import document
 from experiments.page.entries import read_entries
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.summary import Reference, aggregate_scores, scores
+from experiments.speed import tables
 
 ERRORS = {"expert_return_standard_error": 2.0, "expert_cost_standard_error": 1.5}
 
@@ -390,7 +391,7 @@ def test_benchmark_settings_and_table(capsys: pytest.CaptureFixture[str]) -> Non
         "meta_gradient_to_policy_step": 0.1,
         "peak_memory": 900.0,
     }
-    benchmark.print_rows([row])
+    tables.print_rows([row])
     out = capsys.readouterr().out
     for text in ("Swimmer (native)", "8 x 16", "10,000", "0.50", "0.75", "0.10", "12.0", "900"):
         assert text in out
