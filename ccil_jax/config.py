@@ -7,14 +7,35 @@ sweeping it needs no compilation, and it may differ between vmapped runs).
 import dataclasses
 import math
 import numbers
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from ccil_jax.errors import ConfigError
-from ccil_jax.methods import METHODS, Method
+from ccil_jax.methods import Method, find_method
+from ccil_jax.presets import PRESETS
+from ccil_jax.uses import (
+    ACTING,
+    ADVERSARIAL,
+    ALL,
+    ASCENT,
+    BC,
+    CONSTRAINED,
+    CVAG,
+    HELD_OUT,
+    IQ_LEARN,
+    LAGRANGIAN,
+    LIMITED,
+    MALM,
+    META,
+    MULTIPLIER,
+    OFF_POLICY,
+    ON_POLICY,
+    PENALIZED,
+    PID,
+    Use,
+)
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
-    "method": tuple(METHODS),
     "activation": ("tanh", "relu", "swish"),
     "meta_gradient": ("full", "direct", "indirect", "none"),
     "outer_advantage": ("stale", "re-evaluated"),
@@ -26,67 +47,6 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "value_loss": ("value", "v0"),
 }
-
-
-class Use(NamedTuple):
-    """Which configurations a field matters to; to all others it makes no difference, so they refuse it."""
-
-    who: str  # completes "used by ..."
-    methods: tuple[str, ...]
-    where: Callable[["Config"], bool] = lambda config: True  # what other fields must hold besides
-
-    def holds(self, config: "Config") -> bool:
-        """Whether the field matters to `config`."""
-        return config.method in self.methods and self.where(config)
-
-
-def _methods(who: str, holds: Callable[[Method], bool]) -> Use:
-    """A use that the method alone decides."""
-    return Use(who, tuple(name for name, row in METHODS.items() if holds(row)))
-
-
-def _named(who: str, holds: Callable[[Method], bool]) -> Use:
-    """The same, with the names of the methods beside it, or in its place where `who` is empty."""
-    names = ", ".join(_methods(who, holds).methods)
-    return _methods(f"{who} ({names})" if who else names, holds)
-
-
-ALL = _methods("every method", lambda row: True)
-ACTING = _methods("every method that acts while it learns: all but bc", lambda row: row.agent != "behavior_cloning")
-ON_POLICY = _methods("every on-policy method: all but bc and iq_learn", lambda row: row.agent == "on_policy")
-ADVERSARIAL = _named("methods with a discriminator", lambda row: row.reward == "discriminator")
-PENALIZED = Use(
-    "methods with a discriminator whose discriminator_regularizer is gradient_penalty",
-    ADVERSARIAL.methods,
-    lambda config: config.discriminator_regularizer == "gradient_penalty",
-)
-CONSTRAINED = _named("methods in which the cost enters", lambda row: row.limit is not None)
-LIMITED = _named("methods with a prescribed limit", lambda row: row.limit == "prescribed")
-LAGRANGIAN = _named(
-    "methods with a choice of multiplier", lambda row: row.constraint in ("lagrangian", "meta_lagrangian")
-)
-ASCENT = Use(
-    f"{', '.join(LAGRANGIAN.methods)} whose multiplier_update is adam or sgd",
-    LAGRANGIAN.methods,
-    lambda config: config.multiplier_update in ("adam", "sgd"),
-)
-PID = Use(
-    f"pid_il, and {', '.join(LAGRANGIAN.methods)} whose multiplier_update is pid",
-    (*LAGRANGIAN.methods, "pid_il"),
-    lambda config: config.row.constraint == "pid" or config.multiplier_update == "pid",
-)
-MULTIPLIER = Use(
-    f"pid_il, and {', '.join(LAGRANGIAN.methods)} unless multiplier_update is optimal",
-    PID.methods,
-    lambda config: config.has_multiplier,
-)
-MALM = _named("", lambda row: row.constraint == "meta_lagrangian")
-HELD_OUT = Use("malm whose held_out_fraction is above 0", MALM.methods, lambda config: config.held_out_fraction > 0)
-META = Use("malm unless meta_gradient is none", MALM.methods, lambda config: config.meta_gradient != "none")
-CVAG = _named("", lambda row: row.constraint == "alternating")
-BC = _named("", lambda row: row.agent == "behavior_cloning")
-IQ_LEARN = _named("", lambda row: row.agent == "iq_learn")
-OFF_POLICY = _named("", lambda row: row.agent != "on_policy")
 
 
 def _static(default: Any, help: str, use: Use = ON_POLICY) -> Any:
@@ -223,7 +183,7 @@ class Config:
     @property
     def row(self) -> Method:
         """The method's row of the table."""
-        return METHODS[self.method]
+        return find_method(self.method)
 
     @property
     def prescribed_limit(self) -> float | None:
@@ -233,7 +193,7 @@ class Config:
     @property
     def has_multiplier(self) -> bool:
         """Whether the cost is weighed by a multiplier that is carried from one iteration to the next."""
-        return self.row.constraint == "pid" or (LAGRANGIAN.holds(self) and self.multiplier_update != "optimal")
+        return self.row.has_multiplier and not (self.reads("multiplier_update") and self.multiplier_update == "optimal")
 
     @property
     def num_steps(self) -> int:
@@ -243,17 +203,17 @@ class Config:
     @property
     def steps_per_iteration(self) -> int:
         """Environment steps that one iteration of one seed consumes; behaviour cloning needs none."""
-        return 0 if BC.holds(self) else self.generator_steps * self.batch_size
+        return self.generator_steps * self.batch_size if self.reads("env_steps") else 0
 
     @property
     def num_iterations(self) -> int:
         """Iterations needed to consume at least `env_steps`; passes over the demonstrations for behaviour cloning."""
-        return self.bc_epochs if BC.holds(self) else math.ceil(self.env_steps / self.steps_per_iteration)
+        return math.ceil(self.env_steps / self.steps_per_iteration) if self.reads("env_steps") else self.bc_epochs
 
     @property
     def num_held_out(self) -> int:
-        """V: samples kept for the outer loss; 0 for every method but malm."""
-        if not MALM.holds(self):
+        """V: samples kept for the outer loss; 0 for methods without one."""
+        if not self.reads("held_out_fraction"):
             return 0
         if self.held_out_unit == "trajectory":
             return int(self.held_out_fraction * self.num_envs) * self.num_steps
@@ -263,6 +223,10 @@ class Config:
     def num_training(self) -> int:
         """M: samples of the policy step and the critic regressions."""
         return self.batch_size - self.num_held_out
+
+    def reads(self, name: str) -> bool:
+        """Whether the field `name` makes a difference to what this configuration trains."""
+        return name in self.row.reads or _USES[name].holds(self)
 
     def replace(self, **changes: Any) -> "Config":
         """A copy with some fields changed."""
@@ -283,7 +247,7 @@ def unused(config: Config) -> tuple[str, ...]:
 
     `cost_limit` is among them where a method takes its limit from the demonstrations: it is not for the user to give.
     """
-    return tuple(name for name, use in _USES.items() if not use.holds(config))
+    return tuple(name for name in _USES if not config.reads(name))
 
 
 def relevant(config: Config) -> dict[str, Any]:
@@ -300,7 +264,7 @@ def with_limit_of(config: Config, mean_episode_cost: float) -> Config:
     """
     if config.row.limit != "demonstrations":
         return config
-    if config.cost_limit not in (None, mean_episode_cost):
+    if _is_traced(config.cost_limit) or config.cost_limit not in (None, mean_episode_cost):
         raise ConfigError(_limit_by_hand(config))
     return config.replace(cost_limit=mean_episode_cost)
 
@@ -326,83 +290,12 @@ def check_used(config: Config, given: Iterable[str]) -> None:
         )
 
 
-PRESETS: Mapping[str, Mapping[str, Any]] = {
-    # Table 1 says "1 discriminator update" for 3 policy steps. One full-batch step trails the policy (on Swimmer the
-    # two went round in circles), hence minibatches; without a penalty the discriminator then wins outright where the
-    # classes part easily (HalfCheetah).
-    "paper": {},
-    # The best of what docs/ablations.md measures at this length: CVAG's gate by episode, and a multiplier that moves
-    # with the size of the gap (CCIL: 74 % of the return instead of 58 on HalfCheetah, 98 instead of 66 on Swimmer).
-    "default": {
-        "env_steps": 1_500_000,
-        "gate": "episode",
-        "multiplier_update": "sgd",
-        "multiplier_learning_rate": 5e-4,
-    },
-    # Algorithm 1 line by line: one full-batch step of the discriminator, lambda itself projected to [0, max], and the
-    # derivative of line 16 with the policy and its advantages held fixed.
-    "printed": {
-        "meta_gradient": "direct",
-        "multiplier_update": "sgd",
-        "meta_update": "sgd",
-        "discriminator_minibatch_size": 2000,
-        "discriminator_regularizer": "none",
-    },
-    # What the authors' code does: Adam on xi for both steps of the multiplier, CVAG's gate by episode, no value beyond
-    # a time limit. It counts the steps of one batch of the three, so its 1e7 are 3e7 here.
-    "authors": {
-        "meta_gradient": "direct",
-        "gate": "episode",
-        "bootstrap_at_truncation": False,
-        "discriminator_minibatch_size": 2000,
-        "discriminator_regularizer": "none",
-    },
-    # No discriminator has to keep up with the policy: one larger batch and a wider trust region per iteration.
-    "expert": {"env_steps": 2_000_000, "batch_size": 4000, "generator_steps": 1, "max_kl": 0.02, "gamma": 0.99},
-    # Costs are rare here (some 25 visits of a hazard in 20,000 steps), so their gradient is mostly noise. Hence large
-    # batches, small steps, and a multiplier that slows down as the cost nears its limit: Adam's walks past it. A short
-    # lambda for the cost leaves the critic's errors in charge: with 0.8 PointGoal1's cost did not fall at all.
-    "safety_gym_expert": {
-        "env_steps": 8_000_000,
-        "num_envs": 32,
-        "batch_size": 20_000,
-        "generator_steps": 1,
-        "gamma": 0.99,
-        "gae_lambda": 0.9,
-        "critic_learning_rate": 3e-4,
-        "initial_multiplier": 0.0,
-        "multiplier_update": "sgd",
-        "multiplier_learning_rate": 7e-4,
-    },
-    "bc": {"method": "bc"},
-    # As published, but for the length: 60,000 steps with as many updates sufficed on HalfCheetah.
-    "iq_learn": {
-        "method": "iq_learn",
-        "env_steps": 100_000,
-        "num_envs": 4,
-        "batch_size": 1000,
-        "generator_steps": 1,
-        "hidden_sizes": (256, 256),
-        "activation": "relu",
-        "gamma": 0.99,
-        "critic_learning_rate": 3e-4,
-        "actor_learning_rate": 3e-5,
-        "critic_minibatch_size": 256,
-    },
-    "tiny": {
-        "env_steps": 240,
-        "num_envs": 4,
-        "batch_size": 40,
-        "hidden_sizes": (8, 8),
-        "discriminator_minibatch_size": 20,
-        "critic_minibatch_size": 10,
-        "critic_epochs": 2,
-    },
-}
-
-
 def check_types(config: Config) -> None:
     """Raises `ConfigError` for a value of another kind than the field's: one that is no choice, or no such number."""
+    if unknown := set(find_method(config.method).reads) - _DEFAULTS.keys():
+        raise ConfigError(
+            f"--method {config.method}: reads {min(unknown)}, which is no field of Config; correct its row"
+        )
     for name, default in _DEFAULTS.items():
         value = getattr(config, name)
         if name in CHOICES:
@@ -415,10 +308,20 @@ def check_types(config: Config) -> None:
             sound, wanted = isinstance(value, tuple) and all(map(is_integer, value)), "a tuple such as (100, 100)"
         elif isinstance(default, int):
             sound, wanted = is_integer(value), "an integer"
+        elif isinstance(default, str):
+            sound, wanted = isinstance(value, str), "a name"
         else:
             sound, wanted = _is_number(value) or (value is None and default is None), "a number"
         if not sound:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
+
+
+_ANY = 0.5  # within the range of every traced field
+
+
+def _is_traced(value: Any) -> bool:
+    """Whether this is a number of JAX, inside a program perhaps, where nobody knows it yet."""
+    return not isinstance(value, numbers.Number) and getattr(value, "shape", None) == () and hasattr(value, "aval")
 
 
 def _is_number(value: Any) -> bool:
@@ -440,11 +343,21 @@ def validate(config: Config) -> None:
     """Raises `ConfigError` for a combination that cannot run, before anything is compiled.
 
     A field that makes no difference must have its default: any other value was given by hand, in vain. A resolved
-    limit of the demonstrations' is let through; `with_limit_of` compares it with them.
+    limit of the demonstrations' is let through; `with_limit_of` compares it with them. Numbers of JAX, as traced fields
+    have them inside a program, are taken on trust.
     """
+    traced = (name for name in field_names(traced=True) if _is_traced(getattr(config, name)))
+    config = config.replace(**dict.fromkeys(traced, _ANY))
     check_types(config)
     resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
     check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))
+    _check_ranges(config)
+    _check_batches(config)
+    _check_method(config)
+
+
+def _check_ranges(config: Config) -> None:
+    """Each number by itself."""
     for name, default in _DEFAULTS.items():
         if is_integer(default) and getattr(config, name) < 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")
@@ -459,13 +372,39 @@ def validate(config: Config) -> None:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at most 1")
     if config.max_kl == 0:
         raise ConfigError("--max_kl 0: the policy could never move; give a positive radius such as 0.01")
+    if not 0 <= config.held_out_fraction < 1:
+        raise ConfigError(f"--held_out_fraction {config.held_out_fraction}: must be in [0, 1)")
+    if config.pid_smoothing >= 1:
+        raise ConfigError(f"--pid_smoothing {config.pid_smoothing}: must be below 1, or no gap is ever felt")
+
+
+def _check_batches(config: Config) -> None:
+    """That batches divide as they have to, and hold enough samples."""
     if config.batch_size % config.num_envs:
         raise ConfigError(
             f"--batch_size {config.batch_size} is not divisible by --num_envs {config.num_envs}; "
             f"use --batch_size {config.batch_size // config.num_envs * config.num_envs or config.num_envs}"
         )
-    if not 0 <= config.held_out_fraction < 1:
-        raise ConfigError(f"--held_out_fraction {config.held_out_fraction}: must be in [0, 1)")
+    if ON_POLICY.holds(config) and config.critic_minibatch_size > config.num_training:
+        raise ConfigError(
+            f"--critic_minibatch_size {config.critic_minibatch_size} exceeds the {config.num_training} training "
+            f"samples of a batch; use --critic_minibatch_size {config.num_training} or less"
+        )
+    if config.reads("discriminator_minibatch_size") and config.discriminator_minibatch_size > config.batch_size:
+        raise ConfigError(
+            f"--discriminator_minibatch_size {config.discriminator_minibatch_size} exceeds the batch; "
+            f"use --discriminator_minibatch_size {config.batch_size} or less"
+        )
+    if ON_POLICY.holds(config) and config.num_training < config.fisher_stride:
+        raise ConfigError(f"--fisher_stride {config.fisher_stride} exceeds the {config.num_training} training samples")
+    if config.reads("replay_size") and config.replay_size < config.num_envs:
+        raise ConfigError(
+            f"--replay_size {config.replay_size}: holds not even one step of {config.num_envs} simulations"
+        )
+
+
+def _check_method(config: Config) -> None:
+    """What the method needs of its own fields."""
     if MALM.holds(config) and config.multiplier_update not in ("adam", "sgd"):
         raise ConfigError(
             f"--multiplier_update {config.multiplier_update}: has no parameter for malm's outer step; use adam or sgd, "
@@ -478,28 +417,10 @@ def validate(config: Config) -> None:
             "--standardize_cost_advantage true: the optimal multiplier compares the cost's surrogate with its gap, so "
             "it must keep its unit; leave it out"
         )
-    if config.pid_smoothing >= 1:
-        raise ConfigError(f"--pid_smoothing {config.pid_smoothing}: must be below 1, or no gap is ever felt")
     if META.holds(config) and config.num_held_out == 0:
         raise ConfigError(
             f"--held_out_fraction {config.held_out_fraction}: malm's outer loss needs held-out samples; "
             "use --held_out_fraction 0.3, or --meta_gradient none for the Lagrangian method"
-        )
-    if ON_POLICY.holds(config) and config.critic_minibatch_size > config.num_training:
-        raise ConfigError(
-            f"--critic_minibatch_size {config.critic_minibatch_size} exceeds the {config.num_training} training "
-            f"samples of a batch; use --critic_minibatch_size {config.num_training} or less"
-        )
-    if ADVERSARIAL.holds(config) and config.discriminator_minibatch_size > config.batch_size:
-        raise ConfigError(
-            f"--discriminator_minibatch_size {config.discriminator_minibatch_size} exceeds the batch; "
-            f"use --discriminator_minibatch_size {config.batch_size} or less"
-        )
-    if ON_POLICY.holds(config) and config.num_training < config.fisher_stride:
-        raise ConfigError(f"--fisher_stride {config.fisher_stride} exceeds the {config.num_training} training samples")
-    if IQ_LEARN.holds(config) and config.replay_size < config.num_envs:
-        raise ConfigError(
-            f"--replay_size {config.replay_size}: holds not even one step of {config.num_envs} simulations"
         )
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")

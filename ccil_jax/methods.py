@@ -1,37 +1,115 @@
 """The methods, one row each: who learns, where the reward comes from, how the cost enters, and whose limit holds.
 
-Importing this module imports no JAX. The names in a row are keys of the tables that hold the functions:
-`agents.AGENTS`, `reward_models.REWARD_MODELS` and `constraints.CONSTRAINTS`.
+Importing this module imports no JAX. A part of a row is a key of the table that holds the functions (`agents.build`,
+`acting.networks`, `learning.reward_models`, `learning.constraints`), or a function of the user's own with the same
+arguments as the functions there.
 """
 
-from collections.abc import Mapping
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, Literal, NamedTuple, TypeVar
+
+from ccil_jax.errors import ConfigError
+from envs.lookup import hint, named_object
+
+Part = str | Callable[..., Any]
+Maker = TypeVar("Maker", bound=Callable[..., Any])
 
 
 class Method(NamedTuple):
-    """One row of the table. None where the method has no such part."""
+    """One row of the table. A part is None where the method has none."""
 
-    agent: Literal["on_policy", "behavior_cloning", "iq_learn"] = "on_policy"
-    reward: Literal["discriminator", "task"] | None = None
-    constraint: str | None = None
+    agent: Part = "on_policy"
+    reward: Part | None = None
+    constraint: Part | None = None
     limit: Literal["demonstrations", "prescribed"] | None = None  # the first is J_E, the demonstrations' mean cost
+    policy: Part = "gaussian"
+    imitates: bool = True  # whether the method learns from demonstrations
+    has_multiplier: bool = False  # whether a Lagrange multiplier is carried from one iteration to the next
+    preset: str = "default"  # the hyperparameters that a launcher starts from, a key of `config.PRESETS`
+    reads: tuple[str, ...] = ()  # fields of `Config` that parts of the user's own read
 
-    @property
-    def imitates(self) -> bool:
-        """Whether the method learns from demonstrations."""
-        return self.reward != "task"
 
-
-METHODS: Mapping[str, Method] = {
-    "malm": Method(reward="discriminator", constraint="meta_lagrangian", limit="demonstrations"),
+_methods: dict[str, Method] = {  # only `register_method` and `find_method` add to it
+    "malm": Method(reward="discriminator", constraint="meta_lagrangian", limit="demonstrations", has_multiplier=True),
     "cvag": Method(reward="discriminator", constraint="alternating", limit="demonstrations"),
-    "ccil": Method(reward="discriminator", constraint="lagrangian", limit="demonstrations"),
-    "lgail": Method(reward="discriminator", constraint="lagrangian", limit="prescribed"),
+    "ccil": Method(reward="discriminator", constraint="lagrangian", limit="demonstrations", has_multiplier=True),
+    "lgail": Method(reward="discriminator", constraint="lagrangian", limit="prescribed", has_multiplier=True),
     "gail": Method(reward="discriminator", constraint="unconstrained"),
     "cpo_il": Method(reward="discriminator", constraint="trust_region_optimal", limit="demonstrations"),
-    "pid_il": Method(reward="discriminator", constraint="pid", limit="demonstrations"),
-    "bc": Method(agent="behavior_cloning"),
-    "iq_learn": Method(agent="iq_learn"),
-    "trpo": Method(reward="task", constraint="unconstrained"),
-    "expert": Method(reward="task", constraint="lagrangian", limit="prescribed"),
+    "pid_il": Method(reward="discriminator", constraint="pid", limit="demonstrations", has_multiplier=True),
+    "bc": Method(agent="behavior_cloning", preset="bc"),
+    "iq_learn": Method(agent="iq_learn", policy="squashed", preset="iq_learn"),
+    "trpo": Method(reward="task", constraint="unconstrained", imitates=False),
+    "expert": Method(reward="task", constraint="lagrangian", limit="prescribed", imitates=False, has_multiplier=True),
 }
+METHODS: Mapping[str, Method] = MappingProxyType(_methods)
+
+
+def register_method(name: str, method: Method) -> None:
+    """Adds a row to `METHODS`, so that `Config(method=name)` means it.
+
+    For the launchers, which do not know the module that calls this function, write the row as a variable of a module
+    and give `--method package.module:VARIABLE`; it needs no registration.
+
+    Args:
+        name: of the method, as in `Config.method`.
+        method: the row.
+
+    Raises:
+        ConfigError: the name is taken or is no identifier, or the row's parts do not go together.
+    """
+    if not name.isidentifier():
+        raise ConfigError(f"method {name!r}: not an identifier; use letters, digits and underscores")
+    if name in _methods:
+        raise ConfigError(f"method {name}: is registered already; choose another name")
+    _check(name, method)
+    _methods[name] = method
+
+
+def find_method(name: Any) -> Method:
+    """The row of a method.
+
+    Args:
+        name: a key of `METHODS`; or "module:VARIABLE", a row in a module of the user's own, which is imported.
+
+    Raises:
+        ConfigError: there is no such row.
+    """
+    if isinstance(name, str) and name in _methods:
+        return _methods[name]
+    if not isinstance(name, str) or ":" not in name:
+        near = hint(name, list(_methods)) if isinstance(name, str) else ""
+        raise ConfigError(f"--method {name!r}: unknown; {near}choose one of {', '.join(_methods)}")
+    try:
+        method = named_object(name)
+    except ValueError as error:
+        raise ConfigError(f"--method {error}") from None
+    if not isinstance(method, Method):
+        raise ConfigError(f"--method {name}: is of type {type(method).__name__}; name a ccil_jax.Method")
+    _check(name, method)
+    _methods[name] = method
+    return method
+
+
+def _check(name: str, method: Method) -> None:
+    """Raises `ConfigError` for parts that do not go together."""
+    if method.agent == "on_policy" and (method.reward is None or method.constraint is None):
+        raise ConfigError(f"method {name}: an on-policy method needs a reward and a constraint; name both")
+    if method.limit not in (None, "demonstrations", "prescribed"):
+        raise ConfigError(f"method {name}: limit {method.limit!r}: give 'demonstrations', 'prescribed' or None")
+    if method.limit == "demonstrations" and not method.imitates:
+        raise ConfigError(f"method {name}: has no demonstrations to take its limit from; let limit be 'prescribed'")
+
+
+def function_of(part: Part, table: Mapping[str, Maker], what: str) -> Maker | Callable[..., Any]:
+    """The function of a part of a row: the table's, or the user's own.
+
+    Raises:
+        ConfigError: the table has no such name.
+    """
+    if callable(part):
+        return part
+    if part not in table:
+        raise ConfigError(f"{what} {part!r}: unknown; {hint(part, list(table))}choose one of {', '.join(table)}")
+    return table[part]

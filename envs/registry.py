@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from envs.engines import AUTO, PHYSICS, check_physics
-from envs.lookup import hint, named_object, own_object
+from envs.lookup import hint, named_object, own_object, parts
 from envs.options import CHECKS, COMMON
 
 __all__ = ["PHYSICS", "TASKS", "TaskInfo", "check_options", "find_task", "physics_name", "register"]
@@ -180,7 +180,7 @@ def register(
     Raises:
         ValueError: the name is taken or has other characters, or a parameter of `build` lacks a default value.
     """
-    if not re.fullmatch(r"[\w.-]+", str(name)):
+    if not re.fullmatch(r"[\w.-]+", name):
         raise ValueError(f"{name!r}: the name of a task is of letters, digits, '_', '.' and '-'; choose such a name")
     if name in _tasks:
         raise ValueError(f"{name}: a task of this name is registered already; choose another name")
@@ -194,7 +194,9 @@ def register(
         expert_preset=expert_preset,
         original=original,
     )
-    if not isinstance(build, str):
+    if isinstance(build, str):
+        parts(build)  # is it of the right form?
+    else:
         task = _with_signature(task)
     _tasks[name] = task if options is None else dataclasses.replace(task, options=MappingProxyType(dict(options)))
     return _tasks[name]
@@ -207,19 +209,19 @@ def _with_signature(task: TaskInfo) -> TaskInfo:
             f"{task.name}: what builds a task must be a function or a class, not {type(task.build).__name__}; "
             "give one that returns an envs.Environment"
         )
-    options, common = {}, {}
+    options: dict[str, Any] = {}
+    common: dict[str, Any] = {}
     for parameter in inspect.signature(task.build).parameters.values():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        if parameter.name in COMMON:
-            common[parameter.name] = parameter.default
-        elif parameter.default is parameter.empty or parameter.kind is parameter.POSITIONAL_ONLY:
+        always_given = parameter.name in ("physics", "max_episode_steps")
+        lacks_default = parameter.default is parameter.empty and not always_given
+        if lacks_default or parameter.kind is parameter.POSITIONAL_ONLY:
             raise ValueError(
                 f"{task.name}: parameter {parameter.name!r} of what builds the task must have a default value and be "
                 "given by keyword; change its signature"
             )
-        else:
-            options[parameter.name] = parameter.default
+        (common if parameter.name in COMMON else options)[parameter.name] = parameter.default
     limit = common.get("max_episode_steps")
     if limit is inspect.Parameter.empty:
         limit = _MAX_EPISODE_STEPS

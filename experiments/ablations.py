@@ -13,8 +13,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import PRESETS, Config, check_used, unused
+from ccil_jax.config import Config, check_used, unused
 from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.presets import PRESETS
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import plans

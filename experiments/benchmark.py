@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.config import CHOICES, PRESETS, Config
+from ccil_jax.config import Config
+from ccil_jax.methods import METHODS
+from ccil_jax.presets import PRESETS
 from envs.registry import PHYSICS
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
@@ -38,7 +40,7 @@ def make_parser() -> Parser:
         metavar="N",
         help="per seed; one row for each (default: 16)",
     )
-    parser.add_argument("--method", default="malm", choices=CHOICES["method"], help="what is trained (default: malm)")
+    parser.add_argument("--method", default="malm", choices=tuple(METHODS), help="what is trained (default: malm)")
     parser.add_argument(
         "--physics", nargs="+", default=["auto"], choices=PHYSICS, help="engines; one row for each (default: auto)"
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ccil_jax.config import CHOICES
+from ccil_jax.methods import METHODS
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser
 from experiments.cli.tables import show
@@ -38,7 +38,7 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("growth", __doc__ or "")
     parser.add_argument("--env", default="HalfCheetah", metavar="TASK", help="task (default: HalfCheetah)")
-    parser.add_argument("--method", default="malm", choices=CHOICES["method"], help="what is trained (default: malm)")
+    parser.add_argument("--method", default="malm", choices=tuple(METHODS), help="what is trained (default: malm)")
     parser.add_argument("--axes", nargs="+", choices=tuple(AXES), default=tuple(AXES), metavar="AXIS", help="of them")
     parser.add_argument("--largest", type=command_line.positive, metavar="N", help="leave out points beyond N")
     parser.add_argument("--out", type=Path, default=Path("growth"), metavar="DIR", help="new folder (default: growth)")

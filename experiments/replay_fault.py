@@ -41,11 +41,12 @@ def replay(path: Path, demos: Path | None = None) -> list[str]:
 
     import envs
     from ccil_jax.agents import build
-    from ccil_jax.training import guard, runner
+    from ccil_jax.agents.expert import expert_data
+    from ccil_jax.training import guard
 
     env = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
-    config = runner.resolve(run.config, env, demonstrations)
-    agent = build.make(config, env, runner.expert_data(demonstrations))
+    config = build.resolve(run.config, env, demonstrations)
+    agent = build.make(config, env, expert_data(demonstrations))
     state = fault_files.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))
     state, metrics = jax.jit(agent.step)(state)
     return [*guard.not_finite({"metrics": metrics}), *guard.not_finite({"state": state})]

@@ -267,3 +267,14 @@ def test_one_place_says_the_version() -> None:
     place = ROOT / settings["tool"]["hatch"]["version"]["path"]
     assert place == SOURCES["ccil_jax"]
     assert len(re.findall(r'^__version__ = "\d+\.\d+\.\d+"$', place.read_text(encoding="utf-8"), re.MULTILINE)) == 1
+
+
+def test_editors_know_the_public_names_that_are_imported_lazily() -> None:
+    """What a type checker sees of `ccil_jax` is what is there at run time."""
+    import ccil_jax
+
+    (block,) = (node for node in TREES["ccil_jax"].body if isinstance(node, ast.If))
+    seen = {
+        alias.asname: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    assert seen == ccil_jax._HOMES

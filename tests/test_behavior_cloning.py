@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ccil_jax.acting.running_statistics import normalize
-from ccil_jax.agents import behavior_cloning
+from ccil_jax.agents import behavior_cloning, build
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training import runner
 from tests.probe_envs import Walk, numpy_policy, quick_compilation, same_bits, walk_config, walk_demonstrations
@@ -58,12 +59,12 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
     """30 noisy samples are learnt by heart: the held-out loss turns, and the parameters of its lowest point stay."""
     demonstrations = linear_expert(30)
     env = Walk()
-    config = runner.resolve(
+    config = build.resolve(
         walk_config(method="bc", hidden_sizes=(32,), critic_minibatch_size=9, actor_learning_rate=0.02),
         env,
         demonstrations,
     )
-    expert = runner.expert_data(demonstrations)
+    expert = expert_data(demonstrations)
     agent = behavior_cloning.make(config, env, expert)
     state, step, losses, seen = agent.init(jax.random.key(1)), jax.jit(agent.step), [], []
     for _ in range(60):

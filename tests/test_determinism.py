@@ -10,9 +10,10 @@ from typing import Any
 import jax
 import pytest
 
+from ccil_jax.agents import build
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config, unused
 from ccil_jax.methods import METHODS
-from ccil_jax.training import runner
 from ccil_jax.training.checkpointing import Checkpointer
 from ccil_jax.training.manifests import Identity
 from ccil_jax.training.program import compile_program
@@ -81,9 +82,9 @@ DEFAULT = ("malm", "iq_learn")
 def test_a_run_stopped_after_any_iteration_goes_on_as_if_it_had_not_been(method: str, tmp_path: Path) -> None:
     """Through a checkpoint on disk, for every method and every iteration (a few of them, in the quick tests)."""
     demonstrations = walk_demonstrations()
-    config = runner.resolve(config_of(method), Walk(), demonstrations)
+    config = build.resolve(config_of(method), Walk(), demonstrations)
     with quick_compilation():
-        program = compile_program(config, Walk(), runner.expert_data(demonstrations), 2)
+        program = compile_program(config, Walk(), expert_data(demonstrations), 2)
 
     def run(state: Any, length: int) -> Any:
         while length:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from ccil_jax.acting import networks, rollout, running_statistics
+from ccil_jax.acting.networks import Network
 from ccil_jax.acting.rollout import Actor, RolloutState
 from ccil_jax.agents import on_policy
 from ccil_jax.agents.on_policy import AgentState, EpisodeEstimates
 from ccil_jax.config import Config
-from ccil_jax.learning import constraints, policy_step, regression
+from ccil_jax.learning import constraints, policy_step, regression, reward_models
 from ccil_jax.learning.regression import Critic
 from ccil_jax.types import Batch, PyTree, Transition
 from tests.probe_envs import Counter, Probe, Walk, quick_compilation, walk_config
@@ -226,13 +227,17 @@ def assess(steps: Transition, **changes: Any) -> Batch:
 
     @jax.jit
     def run(state: AgentState, steps: Transition) -> Batch:
-        episodes = on_policy.episodes_of_steps(steps, jnp.zeros(()), 5)
-        constraint, model = constraints.unconstrained(config), on_policy.reward_models.task()
-
-        def critic(params: jax.Array, obs: jax.Array) -> jax.Array:
-            return params * obs[..., 0]
-
-        return on_policy.assess(config, critic, model, constraint, state, steps, episodes)[0]
+        critic = Network(init=lambda key: jnp.zeros(()), apply=lambda params, obs: params * obs[..., 0])
+        parts = on_policy.make_parts(
+            config,
+            Counter(),
+            None,
+            critic=critic,
+            constraint=constraints.unconstrained(config),
+            reward_model=reward_models.task(),
+        )
+        samples, _ = on_policy.assess(parts, state, steps)
+        return samples
 
     return run(state, jax.tree.map(jnp.asarray, steps))
 
@@ -321,10 +326,9 @@ def test_both_critics_are_fitted_each_to_its_own_returns() -> None:
     flat = {name: jnp.zeros(64) for name in ("reward_advantage", "cost_advantage", "cost")}
     batch = Batch(obs=obs, action=obs, returns=jnp.concatenate([2 * obs, 1 - obs], axis=1), **flat)
 
-    def line(params: jax.Array, obs: jax.Array) -> jax.Array:
-        return params[0] * obs[..., 0] + params[1]
-
-    fit = jax.jit(lambda critics, key: on_policy.fit_critics(config, line, critics, batch, key))
+    line = Network(init=lambda key: jnp.zeros(2), apply=lambda params, obs: params[0] * obs[..., 0] + params[1])
+    parts = on_policy.make_parts(config, Counter(), None, critic=line)
+    fit = jax.jit(lambda critics, key: on_policy.fit_critics(parts, critics, batch, key))
     fitted, losses = fit(critics, jax.random.key(1))
     assert losses.shape == (2,)
     np.testing.assert_allclose(fitted.params, [[2, 0], [-1, 1]], atol=0.02)

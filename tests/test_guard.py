@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from flax import struct
 
-from ccil_jax.agents import on_policy
+from ccil_jax.agents import build, on_policy
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.agents.on_policy import Agent
-from ccil_jax.training import guard, runner
+from ccil_jax.training import guard
 from ccil_jax.training.guard import GuardedState
 from envs.jax_tools import is_key
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
@@ -65,8 +66,8 @@ class Stepper(NamedTuple):
 @pytest.fixture(scope="module")
 def stepper() -> Stepper:
     demonstrations = walk_demonstrations()
-    config = runner.resolve(walk_config(method="malm"), Walk(), demonstrations)
-    expert = runner.expert_data(demonstrations)
+    config = build.resolve(walk_config(method="malm"), Walk(), demonstrations)
+    expert = expert_data(demonstrations)
 
     def make(fault: Fault) -> Agent:
         rates = {name: getattr(config, name) + getattr(fault, name) for name in RATES}

@@ -1,6 +1,6 @@
 """Methods that are one another's special cases (specs/algorithms.md section 2), bit for bit on a whole training run.
 
-Every run is the production path: `runner.resolve`, then `init` and iterations of `on_policy.make`, jitted and vmapped
+Every run is the production path: `build.resolve`, then `init` and iterations of `on_policy.make`, jitted and vmapped
 over seeds.
 """
 
@@ -14,7 +14,8 @@ import pytest
 
 from ccil_jax import methods
 from ccil_jax.acting import running_statistics
-from ccil_jax.agents import on_policy
+from ccil_jax.agents import build, on_policy
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.agents.on_policy import AgentState
 from ccil_jax.config import Config
 from ccil_jax.learning import reward_models
@@ -51,9 +52,9 @@ def program(reward: str) -> Callable[[Config, ExpertData | None, jax.Array], Run
 
 def train(config: Config, reward: str = "the row's") -> Run:
     demonstrations = walk_demonstrations()
-    config = runner.resolve(config, Walk(), demonstrations)
+    config = build.resolve(config, Walk(), demonstrations)
     with quick_compilation():
-        return program(reward)(config, runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 2))
+        return program(reward)(config, expert_data(demonstrations), jax.random.split(jax.random.key(0), 2))
 
 
 @functools.cache

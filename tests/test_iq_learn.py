@@ -10,6 +10,7 @@ import pytest
 
 from ccil_jax.acting import networks
 from ccil_jax.agents import iq_learn
+from ccil_jax.agents.expert import expert_transitions
 from ccil_jax.agents.iq_learn import Minibatch
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
@@ -45,7 +46,7 @@ def test_a_last_step_counts_only_where_the_task_ended() -> None:
         truncated=np.array([0, 0, 0, 1, 1], bool),
         episode_ends=np.array([2, 4, 5]),
     )
-    found = runner.expert_transitions(demonstrations)
+    found = expert_transitions(demonstrations)
     np.testing.assert_array_equal(found.obs[:, 0], [0, 1, 2])
     np.testing.assert_array_equal(found.next_obs[[0, 2], 0], [1, 3])
     np.testing.assert_array_equal(found.terminated, [0, 1, 0])

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import ccil_jax
-from ccil_jax.config import PRESETS, Config
+from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.methods import METHODS
+from ccil_jax.presets import PRESETS
 from ccil_jax.training.filesystem import file_sha256
 from experiments import evaluate, expert, train
 from experiments.cli import options

@@ -9,14 +9,14 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from ccil_jax.acting import networks, running_statistics
-from ccil_jax.agents import on_policy
+from ccil_jax.agents import build, on_policy
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step, reward_models, trust_region
 from ccil_jax.learning.constraints import Multiplier, Outer
 from ccil_jax.learning.policy_step import PolicyStep
 from ccil_jax.learning.reward_models import RewardModel
 from ccil_jax.learning.trust_region import Directions
-from ccil_jax.training import runner
 from ccil_jax.types import Batch, PyTree
 from tests.probe_envs import (
     PolicyProblem,
@@ -402,8 +402,8 @@ def test_re_evaluated_advantages_against_a_loop(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(policy_step, "outer_problem", watched)
     demonstrations = walk_demonstrations()
     config = walk_config(method="malm", outer_advantage="re-evaluated", held_out_fraction=0.5)
-    config = runner.resolve(config, Walk(), demonstrations)
-    agent = on_policy.make(config, Walk(), runner.expert_data(demonstrations))
+    config = build.resolve(config, Walk(), demonstrations)
+    agent = on_policy.make(config, Walk(), expert_data(demonstrations))
     state, _ = agent.step(agent.init(jax.random.key(5)))  # not jitted, so that what is seen are numbers
 
     transition, held_out = jax.tree.map(np.asarray, (seen["transition"], seen["held_out"]))

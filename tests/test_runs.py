@@ -16,6 +16,7 @@ import pytest
 
 import envs
 from ccil_jax.agents import build
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config
 from ccil_jax.errors import ConfigError
 from ccil_jax.training import runner
@@ -127,8 +128,8 @@ def test_an_iteration_that_is_taken_back_ends_no_episode() -> None:
 
 def test_only_the_last_batch_of_an_iteration_is_kept() -> None:
     """No array of the program holds the steps of all generator steps, which at large sizes would be gigabytes."""
-    config = runner.resolve(walk_config(method="malm", generator_steps=3), Walk(), walk_demonstrations())
-    agent = build.make(config, Walk(), runner.expert_data(walk_demonstrations()))
+    config = build.resolve(walk_config(method="malm", generator_steps=3), Walk(), walk_demonstrations())
+    agent = build.make(config, Walk(), expert_data(walk_demonstrations()))
     state = jax.eval_shape(agent.init, jax.random.key(0))
     shapes = {value.aval.shape for value in values_of(jax.make_jaxpr(agent.step)(state).jaxpr)}
     batch = (config.num_steps, config.num_envs)
@@ -163,14 +164,16 @@ def test_fields_that_agree_stay_numbers() -> None:
 ON_FOUR_DEVICES = """
 import json, sys, jax
 from ccil_jax.acting import evaluation
+from ccil_jax.agents import build
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.training import runner
 from ccil_jax.training.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 env, demonstrations = Walk(), walk_demonstrations()
-expert, keys = runner.expert_data(demonstrations), jax.random.split(jax.random.key(0), 5)
+expert, keys = expert_data(demonstrations), jax.random.split(jax.random.key(0), 5)
 configs = [
-    runner.resolve(walk_config(method=sys.argv[1], critic_learning_rate=rate), env, demonstrations)
+    build.resolve(walk_config(method=sys.argv[1], critic_learning_rate=rate), env, demonstrations)
     for rate in (0.01, 0.02, 0.05)
 ]
 shared, varied = runner.join(configs, num_seeds=2)
@@ -218,7 +221,7 @@ def test_devices_share_runs_without_a_word(method: str) -> None:
 def test_a_chunk_of_iterations_stays_on_its_device() -> None:
     """A compiled iteration over MJX physics does not speak to the host, and what it needs is refused from there."""
     env = envs.make("Swimmer", physics="mjx")
-    small = runner.resolve(walk_config(method="trpo"), env, None)
+    small = build.resolve(walk_config(method="trpo"), env, None)
     with quick_compilation():
         program = compile_program(small, env, None, 1)
     calls = set(re.findall(r'custom_call_target="([^"]+)"', program.text()))

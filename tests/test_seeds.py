@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax.agents import on_policy
-from ccil_jax.training import runner
+from ccil_jax.agents import build, on_policy
+from ccil_jax.agents.expert import expert_data
 from ccil_jax.training.guard import GuardedState
 from ccil_jax.training.program import Program, compile_program
 from ccil_jax.types import Metrics
@@ -63,8 +63,8 @@ class Compiled:
 @pytest.fixture(scope="module")
 def compiled() -> Compiled:
     env, demonstrations, listener = TracedWalk(), walk_demonstrations(), Compilations()
-    config = runner.resolve(walk_config(method="malm"), env, demonstrations)
-    expert = runner.expert_data(demonstrations)
+    config = build.resolve(walk_config(method="malm"), env, demonstrations)
+    expert = expert_data(demonstrations)
     jax.monitoring.register_event_duration_secs_listener(listener)
     program = compile_program(config, env, expert, NUM_SEEDS)
     jax.monitoring.unregister_event_duration_listener(listener)
@@ -130,8 +130,8 @@ def test_a_program_is_two_functions_compiled_once_each(compiled: Compiled, compi
 def test_every_random_key_is_consumed_once() -> None:
     """JAX's own check, on keys within the program and on those that one iteration hands to the next."""
     demonstrations = walk_demonstrations()
-    config = runner.resolve(walk_config(method="malm"), Walk(), demonstrations)
-    agent = on_policy.make(config, Walk(), runner.expert_data(demonstrations))
+    config = build.resolve(walk_config(method="malm"), Walk(), demonstrations)
+    agent = on_policy.make(config, Walk(), expert_data(demonstrations))
     with jax.debug_key_reuse(True), quick_compilation():
         state, step = jax.jit(agent.init)(jax.random.key(0)), jax.jit(agent.step)
         for _ in range(2):
@@ -142,7 +142,7 @@ def test_every_random_key_is_consumed_once() -> None:
 def test_no_seed_waits_for_anothers_thread(regularizer: str) -> None:
     """Batched LAPACK kernels on the CPU wait for helpers from the pool that they occupy; with few threads, for ever."""
     config, env = walk_config(method="malm", discriminator_regularizer=regularizer).replace(cost_limit=1.0), Walk()
-    expert = runner.expert_data(walk_demonstrations())
+    expert = expert_data(walk_demonstrations())
     agent = on_policy.make(config, env, expert)
     init = str(jax.make_jaxpr(jax.vmap(agent.init))(jax.random.split(jax.random.key(0), 2)))
     step = str(jax.make_jaxpr(agent.step)(jax.eval_shape(agent.init, jax.random.key(0))))

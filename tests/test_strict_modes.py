@@ -13,7 +13,8 @@ import ccil_jax
 import envs
 from ccil_jax.acting import evaluation
 from ccil_jax.agents import build
-from ccil_jax.training import guard, runner
+from ccil_jax.agents.expert import expert_data
+from ccil_jax.training import guard
 from envs.adapters import GymnasiumVectorEnv
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
@@ -61,8 +62,8 @@ def test_learners_mix_neither_types_nor_ranks_and_use_keys_once(name: str, x64: 
     env, choices = Walk(), LEARNERS[name]
     with strict_tracing(x64):
         demonstrations = None if choices["method"] == "expert" else walk_demonstrations()
-        config = runner.resolve(walk_config(**choices), env, demonstrations)
-        agent = guard.protect(build.make(config, env, runner.expert_data(demonstrations)), config.max_skipped_updates)
+        config = build.resolve(walk_config(**choices), env, demonstrations)
+        agent = guard.protect(build.make(config, env, expert_data(demonstrations)), config.max_skipped_updates)
         state = jax.eval_shape(jax.vmap(agent.init), jax.random.split(jax.random.key(0), 2))
         after, _ = jax.eval_shape(jax.vmap(agent.step), state)
     assert jax.tree.map(_form, after) == jax.tree.map(_form, state)

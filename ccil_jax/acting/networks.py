@@ -1,15 +1,17 @@
 """The networks: policies, critics and discriminator. The rest of the package sees only init and apply."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ccil_jax.acting.distributions import Gaussian, TanhGaussian
 from ccil_jax.config import Config
+from ccil_jax.methods import function_of
 from ccil_jax.types import PyTree
 from envs.base import Environment
 
@@ -104,11 +106,25 @@ def make_squashed_policy(config: Config, env: Environment) -> SquashedPolicy:
     return SquashedPolicy(init, apply)
 
 
-def policy_of(config: Config, env: Environment) -> Policy | SquashedPolicy:
-    """The policy network of `config.method`, for acting with parameters that were learnt."""
-    if config.method == "iq_learn":
-        return make_squashed_policy(config, env)
-    return make_policy(config, env.obs_dim, env.action_dim)
+def initial_std(env: Environment) -> np.ndarray:
+    """1 (authors), but no wider than the range's half: Humanoid's actions in +-0.4 would nearly all be clipped."""
+    return np.minimum(1.0, (np.asarray(env.action_high) - np.asarray(env.action_low)) / 2)
+
+
+def gaussian(config: Config, env: Environment) -> Policy:
+    """`make_policy` for a task."""
+    return make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
+
+
+POLICIES: Mapping[str, Callable[[Config, Environment], Policy | SquashedPolicy]] = {  # by the names in `METHODS`
+    "gaussian": gaussian,
+    "squashed": make_squashed_policy,
+}
+
+
+def policy_of(config: Config, env: Environment) -> Any:
+    """The policy network of `config.method`: a `Policy`, or a `SquashedPolicy`."""
+    return function_of(config.row.policy, POLICIES, "policy")(config, env)
 
 
 def make_scalar(config: Config, input_dim: int, final_scale: float = 1.0) -> Network:

@@ -9,11 +9,12 @@ from flax import struct
 
 from ccil_jax.acting import distributions, networks, running_statistics
 from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.acting.networks import Policy
 from ccil_jax.acting.rollout import Actor
-from ccil_jax.agents.on_policy import Agent, initial_std
+from ccil_jax.agents.base import Agent
 from ccil_jax.config import Config
 from ccil_jax.learning.minibatches import minibatches
-from ccil_jax.learning.optimizers import adam
+from ccil_jax.learning.optimizers import Optimizer, adam
 from ccil_jax.types import ExpertData, Metrics, PyTree
 from envs.base import Environment
 
@@ -38,11 +39,25 @@ def negative_log_likelihood(
     return -jnp.mean(distributions.log_prob(apply(params, obs), action))
 
 
-def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
+def _keep_wide(params: PyTree) -> PyTree:
+    """The parameters with log-deviations of at least `SMALLEST_LOG_STD`, where the policy has them as `log_std`."""
+    if not (isinstance(params, dict) and "log_std" in params):
+        return params
+    return {**params, "log_std": jnp.maximum(params["log_std"], SMALLEST_LOG_STD)}
+
+
+def make(
+    config: Config,
+    env: Environment,
+    expert: ExpertData | None,
+    *,
+    policy: Policy | None = None,
+    optimizer: Optimizer = adam,
+) -> Agent:
     """Builds the agent; an iteration is one pass over the demonstrations."""
     assert expert is not None, "bc learns from demonstrations"
-    policy = networks.make_policy(config, env.obs_dim, env.action_dim, initial_std(env))
-    optimizer = adam(config.actor_learning_rate)
+    policy = networks.policy_of(config, env) if policy is None else policy
+    apply, rule = policy.apply, optimizer(config.actor_learning_rate)
     statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
     obs = running_statistics.normalize(statistics, expert.obs)
     held_out_obs = running_statistics.normalize(statistics, expert.held_out_obs)
@@ -56,24 +71,24 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             actor=Actor(policy_params=jax.tree.map(jnp.copy, params), obs_statistics=statistics),
             held_out_loss=jnp.asarray(jnp.inf),
             params=params,
-            optimizer=optimizer.init(params),
+            optimizer=rule.init(params),
             key=key,
         )
 
     def descend(learner: tuple[PyTree, PyTree], indices: jax.Array) -> tuple[tuple[PyTree, PyTree], jax.Array]:
         params, optimizer_state = learner
         loss, gradient = jax.value_and_grad(negative_log_likelihood, argnums=1)(
-            policy.apply, params, obs[indices], expert.action[indices]
+            apply, params, obs[indices], expert.action[indices]
         )
-        change, optimizer_state = optimizer.update(gradient, optimizer_state)
+        change, optimizer_state = rule.update(gradient, optimizer_state, params)
         params = optax.apply_updates(params, change)
-        return ({**params, "log_std": jnp.maximum(params["log_std"], SMALLEST_LOG_STD)}, optimizer_state), loss
+        return (_keep_wide(params), optimizer_state), loss
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, shuffle_key = jax.random.split(state.key)
         order = minibatches(shuffle_key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=1)
         (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), order)
-        held_out = negative_log_likelihood(policy.apply, params, held_out_obs, expert.held_out_action)
+        held_out = negative_log_likelihood(apply, params, held_out_obs, expert.held_out_action)
         better = held_out < state.held_out_loss
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), params, state.actor.policy_params)
         new = AgentState(
@@ -83,7 +98,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None) -> Agent:
             optimizer=optimizer_state,
             key=key,
         )
-        entropy = distributions.entropy(Gaussian(mean=jnp.zeros(()), log_std=best["log_std"]))
+        entropy = distributions.entropy(apply(best, held_out_obs))
         return new, {"loss": jnp.mean(losses), "held_out_loss": held_out, "entropy": entropy}
 
     return Agent(init, step)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from ccil_jax.config import Config
 from ccil_jax.learning.multipliers import Gains, optimal_weights, pid_init, pid_step
 from ccil_jax.learning.optimizers import adam
+from ccil_jax.methods import function_of
 from ccil_jax.types import Metrics, PyTree
 
 # Adam moves xi by about its learning rate an update, so after a long time within the limit a vanishing softplus(xi)
@@ -45,50 +46,64 @@ class Outer:
 
 
 @struct.dataclass(kw_only=True)
-class Episodes:
-    """What is known of the episode that each step of a batch belongs to, [T, N]."""
+class EpisodeCosts:
+    """The cost of the episode that each step of a batch belongs to, and the limit."""
 
-    cost: jax.Array  # total if it finished within the batch, else extrapolated to a full-length episode
+    cost: jax.Array  # [T, N] total if it finished within the batch, else extrapolated to a full-length episode
     limit: jax.Array  # [] J_E
 
 
-class Constraint(NamedTuple):
-    """Pure functions. `entropy_in_cost`: steps may follow the cost alone, which must then carry the entropy bonus."""
-
-    init: Callable[[], PyTree]
-    multiplier: Callable[[PyTree], jax.Array]  # state -> lambda >= 0
-    gate: Callable[[jax.Array, jax.Array, Episodes], jax.Array]  # A_r, A_c, episodes -> A_r, all [T, N]
-    combine: Callable[[jax.Array, jax.Array, jax.Array], jax.Array]  # lambda, step_gap, gram [2, 2] -> weights [2]
-    update: Callable[[PyTree, jax.Array, Outer | None], tuple[PyTree, Metrics]]  # state, cost_gap, outer
-    entropy_in_cost: bool = False
+def _no_state() -> PyTree:
+    return ()
 
 
-def _no_gate(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
+def _no_multiplier(state: PyTree) -> jax.Array:
+    return jnp.zeros(())
+
+
+def _no_gate(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: EpisodeCosts) -> jax.Array:
     return reward_advantage
+
+
+def _reward_alone(multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array) -> jax.Array:
+    return jnp.array([1.0, 0.0])
+
+
+def _learn_nothing(state: PyTree, cost_gap: jax.Array, outer: Outer | None) -> tuple[PyTree, Metrics]:
+    return state, {}
+
+
+class Constraint(NamedTuple):
+    """How the cost enters, as pure functions. By default it does not: a constraint states what differs.
+
+    `entropy_in_cost`: steps may follow the cost alone, which must then carry the entropy bonus.
+    """
+
+    init: Callable[[], PyTree] = _no_state
+    multiplier: Callable[[PyTree], jax.Array] = _no_multiplier  # state -> lambda >= 0, []
+    gate: Callable[[jax.Array, jax.Array, EpisodeCosts], jax.Array] = _no_gate  # A_r, A_c, episodes -> A_r, [T, N] each
+    # lambda [], step_gap [], gram [2, 2] -> weights [2] of the reward's and the cost's direction
+    combine: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] = _reward_alone
+    update: Callable[[PyTree, jax.Array, Outer | None], tuple[PyTree, Metrics]] = _learn_nothing  # state, cost_gap []
+    entropy_in_cost: bool = False
 
 
 def unconstrained(config: Config) -> Constraint:
     """The cost does not enter (GAIL, TRPO)."""
-    return Constraint(
-        init=lambda: (),
-        multiplier=lambda state: jnp.zeros(()),
-        gate=_no_gate,
-        combine=lambda multiplier, step_gap, gram: jnp.array([1.0, 0.0]),
-        update=lambda state, cost_gap, outer: (state, {}),
-    )
+    return Constraint()
 
 
 def lagrangian(config: Config) -> Constraint:
-    """Reward less lambda times cost, lambda by `config.multiplier_update`; dual ascent is Algorithm 1 line 14."""
-    if config.multiplier_update == "pid":
-        return pid(config)
-    if config.multiplier_update == "optimal":
-        return trust_region_optimal(config)
+    """Reward less lambda times cost, lambda by the rule `config.multiplier_update` of `MULTIPLIER_UPDATES`."""
+    return MULTIPLIER_UPDATES[config.multiplier_update](config)
+
+
+def dual_ascent(config: Config) -> Constraint:
+    """Reward less lambda times cost, lambda by dual ascent along the cost gap (Algorithm 1 line 14)."""
     multiplier = ascent(config)
     return Constraint(
         init=multiplier.init,
         multiplier=multiplier.read,
-        gate=_no_gate,
         combine=_less_cost,
         update=lambda state, cost_gap, outer: (multiplier.dual(state, cost_gap), {}),
     )
@@ -110,7 +125,6 @@ def pid(config: Config) -> Constraint:
     return Constraint(
         init=lambda: pid_init(config.initial_multiplier),
         multiplier=lambda state: state.multiplier,
-        gate=_no_gate,
         combine=_less_cost,
         update=lambda state, cost_gap, outer: (pid_step(state, cost_gap / scale, gains, config.multiplier_max), {}),
     )
@@ -118,13 +132,7 @@ def pid(config: Config) -> Constraint:
 
 def trust_region_optimal(config: Config) -> Constraint:
     """The multiplier that is optimal for this one step, in closed form (constrained policy optimisation): no memory."""
-    return Constraint(
-        init=lambda: (),
-        multiplier=lambda state: jnp.zeros(()),
-        gate=_no_gate,
-        combine=lambda multiplier, step_gap, gram: optimal_weights(gram, step_gap, config.max_kl),
-        update=lambda state, cost_gap, outer: (state, {}),
-    )
+    return Constraint(combine=lambda multiplier, step_gap, gram: optimal_weights(gram, step_gap, config.max_kl))
 
 
 def meta_lagrangian(config: Config) -> Constraint:
@@ -184,14 +192,13 @@ def alternating(config: Config) -> Constraint:
     def by_batch(multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array) -> jax.Array:
         return jnp.where(step_gap <= 0, jnp.array([1.0, 0.0]), jnp.array([0.0, -1.0]))
 
-    def by_episode(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: Episodes) -> jax.Array:
+    def by_episode(reward_advantage: jax.Array, cost_advantage: jax.Array, episodes: EpisodeCosts) -> jax.Array:
         mixed = jnp.where(episodes.cost <= episodes.limit, reward_advantage, -cost_advantage)
         return (mixed - jnp.mean(mixed)) / (jnp.std(mixed) + 1e-8)
 
-    plain = unconstrained(config)
     if config.gate == "episode":
-        return plain._replace(gate=by_episode)
-    return plain._replace(combine=by_batch, entropy_in_cost=True)
+        return Constraint(gate=by_episode)
+    return Constraint(combine=by_batch, entropy_in_cost=True)
 
 
 def inverse_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
@@ -200,6 +207,12 @@ def inverse_softplus(value: Float[Array, ""]) -> Float[Array, ""]:
     return value + jnp.log(-jnp.expm1(-value))
 
 
+MULTIPLIER_UPDATES: Mapping[str, Callable[[Config], Constraint]] = {  # `Config.multiplier_update`
+    "adam": dual_ascent,
+    "sgd": dual_ascent,
+    "pid": pid,
+    "optimal": trust_region_optimal,
+}
 CONSTRAINTS: Mapping[str, Callable[[Config], Constraint]] = {  # by the names in `methods.METHODS`
     "unconstrained": unconstrained,
     "lagrangian": lagrangian,
@@ -213,7 +226,8 @@ CONSTRAINTS: Mapping[str, Callable[[Config], Constraint]] = {  # by the names in
 def make(config: Config) -> Constraint:
     """The constraint of `config.method`, an on-policy one."""
     assert config.row.constraint is not None, f"{config.method} has no policy step to constrain"
-    return CONSTRAINTS[config.row.constraint](config)
+    constraint: Constraint = function_of(config.row.constraint, CONSTRAINTS, "constraint")(config)
+    return constraint
 
 
 class Ascent(NamedTuple):

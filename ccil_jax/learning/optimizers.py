@@ -1,9 +1,13 @@
 """Adam, as every part of the package that follows gradients uses it."""
 
+from collections.abc import Callable
+
 import optax
 from jaxtyping import Array, Float
 
 from envs.jax_tools import usual_rules
+
+Optimizer = Callable[[Float[Array, ""] | float], optax.GradientTransformation]  # learning rate -> update rule
 
 
 def adam(learning_rate: Float[Array, ""] | float) -> optax.GradientTransformation:

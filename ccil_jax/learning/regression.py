@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ccil_jax.learning.minibatches import minibatches
-from ccil_jax.learning.optimizers import adam
+from ccil_jax.learning.optimizers import Optimizer, adam
 from ccil_jax.types import PyTree
 
 
@@ -21,9 +21,9 @@ class Critic:
     optimizer: PyTree
 
 
-def init(params: PyTree, learning_rate: Float[Array, ""] | float) -> Critic:
+def init(params: PyTree, learning_rate: Float[Array, ""] | float, optimizer: Optimizer = adam) -> Critic:
     """A critic that has not been fitted."""
-    return Critic(params=params, optimizer=adam(learning_rate).init(params))
+    return Critic(params=params, optimizer=optimizer(learning_rate).init(params))
 
 
 def fit(
@@ -36,20 +36,21 @@ def fit(
     learning_rate: Float[Array, ""] | float,
     num_epochs: int,
     minibatch_size: int,
+    optimizer: Optimizer = adam,
 ) -> tuple[Critic, Float[Array, ""]]:
     """Minimises mean (apply(params, obs) - target)^2; every epoch is a fresh shuffle, its last partial batch dropped.
 
     Returns:
         The fitted critic, and the mean loss over the last epoch.
     """
-    optimizer = adam(learning_rate)
+    rule = optimizer(learning_rate)
 
     def loss(params: PyTree, indices: jax.Array) -> jax.Array:
         return jnp.mean((apply(params, obs[indices]) - target[indices]) ** 2)
 
     def descend(critic: Critic, indices: jax.Array) -> tuple[Critic, jax.Array]:
         value, gradient = jax.value_and_grad(loss)(critic.params, indices)
-        updates, optimizer_state = optimizer.update(gradient, critic.optimizer)
+        updates, optimizer_state = rule.update(gradient, critic.optimizer)
         return Critic(params=optax.apply_updates(critic.params, updates), optimizer=optimizer_state), value
 
     indices = minibatches(key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=num_epochs)

@@ -5,7 +5,7 @@ h = -logit(D) and its reward -log D is softplus(h): an expert-like learner earns
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -15,21 +15,31 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ccil_jax.acting import running_statistics
-from ccil_jax.acting.networks import Network
+from ccil_jax.acting.networks import Network, make_scalar
 from ccil_jax.acting.running_statistics import RunningStatistics
 from ccil_jax.config import Config
 from ccil_jax.learning.minibatches import minibatches
-from ccil_jax.learning.optimizers import adam
+from ccil_jax.learning.optimizers import Optimizer, adam
+from ccil_jax.methods import function_of
 from ccil_jax.types import ExpertData, Metrics, PyTree, Transition
+from envs.base import Environment
 from envs.jax_tools import scan
 
 
-class RewardModel(NamedTuple):
-    """A reward and how it learns."""
+def _no_state(key: jax.Array) -> PyTree:
+    return ()
 
-    init: Callable[[jax.Array], PyTree]  # key -> state
-    reward: Callable[[PyTree, Transition], jax.Array]  # state, [T, N] -> [T, N], state held fixed
-    update: Callable[[PyTree, Transition, jax.Array], tuple[PyTree, Metrics]]  # state, [T, N], key
+
+def _learn_nothing(state: PyTree, transition: Transition, key: jax.Array) -> tuple[PyTree, Metrics]:
+    return state, {}
+
+
+class RewardModel(NamedTuple):
+    """A reward and how it learns, as pure functions. By default it has nothing to learn."""
+
+    reward: Callable[[PyTree, Transition], jax.Array]  # state, transitions [T, N] -> [T, N]; the state is held fixed
+    init: Callable[[jax.Array], PyTree] = _no_state  # key -> state
+    update: Callable[[PyTree, Transition, jax.Array], tuple[PyTree, Metrics]] = _learn_nothing  # state, [T, N], key
 
 
 REWARD_FORMS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -41,11 +51,7 @@ REWARD_FORMS: dict[str, Callable[[jax.Array], jax.Array]] = {
 
 def task() -> RewardModel:
     """The environment's own reward."""
-    return RewardModel(
-        init=lambda key: (),
-        reward=lambda state, transition: transition.reward,
-        update=lambda state, transition, key: (state, {}),
-    )
+    return RewardModel(reward=lambda state, transition: transition.reward)
 
 
 @struct.dataclass(kw_only=True)
@@ -110,56 +116,84 @@ def largest_singular_value(matrix: Float[Array, "N M"], num_iterations: int = 20
     return (left / (jnp.linalg.norm(left) + 1e-12)) @ matrix @ right
 
 
-def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim: int) -> RewardModel:
+class _Classifier(NamedTuple):
+    """Pure functions of a discriminator's logits."""
+
+    inputs: Callable[[RunningStatistics, jax.Array, jax.Array], jax.Array]  # statistics, obs, action -> [..., D]
+    # params, expert inputs [M, D], learner inputs [M, D], key -> loss, logits of both [M]
+    loss: Callable[[PyTree, jax.Array, jax.Array, jax.Array], tuple[jax.Array, tuple[jax.Array, jax.Array]]]
+
+
+def _classifier(config: Config, network: Network) -> _Classifier:
+    def inputs(statistics: RunningStatistics, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return jnp.concatenate([running_statistics.normalize(statistics, obs), action], axis=-1)
+
+    def loss(
+        params: PyTree, expert_inputs: jax.Array, learner_inputs: jax.Array, key: jax.Array
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        logits = functools.partial(network.apply, params)
+        on_expert, on_learner = logits(expert_inputs), logits(learner_inputs)
+        value = classification_loss(on_expert, on_learner, config.discriminator_entropy_coefficient)
+        if config.discriminator_regularizer == "gradient_penalty":
+            penalty = gradient_penalty(logits, expert_inputs, learner_inputs, key)
+            value = value + config.gradient_penalty_coefficient * penalty
+        return value, (on_expert, on_learner)
+
+    return _Classifier(inputs, loss)
+
+
+def _descend(
+    classifier: _Classifier,
+    rule: optax.GradientTransformation,
+    expert: ExpertData,
+    state: Discriminator,
+    learner: tuple[jax.Array, jax.Array],
+    key: jax.Array,
+) -> tuple[Discriminator, Metrics]:
+    """One gradient step on a minibatch of the learner's steps, and on as many of the expert's, drawn at random."""
+    choice_key, penalty_key = jax.random.split(key)
+    learner_obs, learner_action = learner
+    indices = jax.random.randint(choice_key, (learner_obs.shape[0],), 0, expert.obs.shape[0])
+    expert_obs, expert_action = expert.obs[indices], expert.action[indices]
+    statistics = running_statistics.update(state.statistics, jnp.concatenate([learner_obs, expert_obs]))
+    expert_inputs = classifier.inputs(statistics, expert_obs, expert_action)
+    learner_inputs = classifier.inputs(statistics, learner_obs, learner_action)
+    (value, (on_expert, on_learner)), gradient = jax.value_and_grad(classifier.loss, has_aux=True)(
+        state.params, expert_inputs, learner_inputs, penalty_key
+    )
+    updates, optimizer_state = rule.update(gradient, state.optimizer, state.params)
+    new = Discriminator(
+        params=optax.apply_updates(state.params, updates), optimizer=optimizer_state, statistics=statistics
+    )
+    return new, {
+        "discriminator_loss": value,
+        "discriminator_accuracy_expert": jnp.mean(on_expert > 0),
+        "discriminator_accuracy_learner": jnp.mean(on_learner < 0),
+    }
+
+
+def discriminator(
+    config: Config, network: Network, expert: ExpertData, obs_dim: int, optimizer: Optimizer = adam
+) -> RewardModel:
     """The adversarial reward of GAIL (Ho and Ermon 2016).
 
     It judges the learner's actions as they were sampled. Once clipped as the environment executes them, all actions
     beyond the range would earn alike, and a policy whose mean has left the range would have no way back.
     """
-    optimizer = adam(config.discriminator_learning_rate)
+    rule = optimizer(config.discriminator_learning_rate)
     if config.discriminator_regularizer == "spectral_norm":
         network = spectrally_normalized(network)
-
-    def inputs(statistics: RunningStatistics, obs: jax.Array, action: jax.Array) -> jax.Array:
-        return jnp.concatenate([running_statistics.normalize(statistics, obs), action], axis=-1)
+    classifier = _classifier(config, network)
+    inputs = classifier.inputs
 
     def init(key: jax.Array) -> Discriminator:
         params = network.init(key)
         statistics = running_statistics.update(running_statistics.init(obs_dim), expert.obs)
-        return Discriminator(params=params, optimizer=optimizer.init(params), statistics=statistics)
+        return Discriminator(params=params, optimizer=rule.init(params), statistics=statistics)
 
     def reward(state: Discriminator, transition: Transition) -> jax.Array:
         logits = network.apply(state.params, inputs(state.statistics, transition.obs, transition.action))
         return REWARD_FORMS[config.reward_form](logits)
-
-    def descend(
-        state: Discriminator, learner: tuple[jax.Array, jax.Array], key: jax.Array
-    ) -> tuple[Discriminator, Metrics]:
-        choice_key, penalty_key = jax.random.split(key)
-        indices = jax.random.randint(choice_key, (learner[0].shape[0],), 0, expert.obs.shape[0])
-        expert_obs, expert_action = expert.obs[indices], expert.action[indices]
-        statistics = running_statistics.update(state.statistics, jnp.concatenate([learner[0], expert_obs]))
-        expert_inputs, learner_inputs = inputs(statistics, expert_obs, expert_action), inputs(statistics, *learner)
-
-        def loss(params: PyTree) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-            logits = functools.partial(network.apply, params)
-            on_expert, on_learner = logits(expert_inputs), logits(learner_inputs)
-            value = classification_loss(on_expert, on_learner, config.discriminator_entropy_coefficient)
-            if config.discriminator_regularizer == "gradient_penalty":
-                penalty = gradient_penalty(logits, expert_inputs, learner_inputs, penalty_key)
-                value = value + config.gradient_penalty_coefficient * penalty
-            return value, (on_expert, on_learner)
-
-        (value, (on_expert, on_learner)), gradient = jax.value_and_grad(loss, has_aux=True)(state.params)
-        updates, optimizer_state = optimizer.update(gradient, state.optimizer)
-        new = Discriminator(
-            params=optax.apply_updates(state.params, updates), optimizer=optimizer_state, statistics=statistics
-        )
-        return new, {
-            "discriminator_loss": value,
-            "discriminator_accuracy_expert": jnp.mean(on_expert > 0),
-            "discriminator_accuracy_learner": jnp.mean(on_learner < 0),
-        }
 
     def update(state: Discriminator, transition: Transition, key: jax.Array) -> tuple[Discriminator, Metrics]:
         learner = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, transition.action))
@@ -173,10 +207,32 @@ def discriminator(config: Config, network: Network, expert: ExpertData, obs_dim:
 
         def step(state: Discriminator, minibatch: tuple[jax.Array, jax.Array]) -> tuple[Discriminator, Metrics]:
             indices, key = minibatch
-            return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
+            return _descend(classifier, rule, expert, state, jax.tree.map(lambda x: x[indices], learner), key)
 
         state, metrics = scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
         held_out = network.apply(state.params, inputs(state.statistics, expert.held_out_obs, expert.held_out_action))
         return state, jax.tree.map(jnp.mean, metrics) | {"discriminator_accuracy_held_out": jnp.mean(held_out > 0)}
 
-    return RewardModel(init, reward, update)
+    return RewardModel(reward, init, update)
+
+
+def adversarial(config: Config, env: Environment, expert: ExpertData | None, optimizer: Optimizer) -> RewardModel:
+    """`discriminator` with a network of `config.hidden_sizes`."""
+    assert expert is not None, f"{config.method} learns from demonstrations"
+    # A small last layer: an untrained discriminator must not reward anything in particular.
+    network = make_scalar(config, env.obs_dim + env.action_dim, final_scale=0.01)
+    return discriminator(config, network, expert, env.obs_dim, optimizer)
+
+
+Maker = Callable[[Config, Environment, ExpertData | None, Optimizer], RewardModel]
+REWARD_MODELS: Mapping[str, Maker] = {  # by the names in `METHODS`
+    "discriminator": adversarial,
+    "task": lambda config, env, expert, optimizer: task(),
+}
+
+
+def make(config: Config, env: Environment, expert: ExpertData | None, optimizer: Optimizer = adam) -> RewardModel:
+    """The reward model of `config.method`, an on-policy one. `expert` is None where the method does not imitate."""
+    assert config.row.reward is not None, f"{config.method} has no reward"
+    model: RewardModel = function_of(config.row.reward, REWARD_MODELS, "reward")(config, env, expert, optimizer)
+    return model

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from ccil_jax.acting.rollout import Actor
-from ccil_jax.agents.on_policy import Agent
+from ccil_jax.agents.base import Agent
 from ccil_jax.types import Metrics, PyTree
 from envs.jax_tools import compute_where, is_key
 

@@ -18,7 +18,7 @@ from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from ccil_jax.agents import build
-from ccil_jax.agents.on_policy import Agent
+from ccil_jax.agents.base import Agent
 from ccil_jax.config import Config
 from ccil_jax.meshes import mesh_of, run_mesh
 from ccil_jax.training import guard

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ccil_jax.acting.rollout import Actor
-from ccil_jax.agents import iq_learn
-from ccil_jax.config import Config, field_names, is_integer, validate, with_limit_of
-from ccil_jax.demonstrations.trajectories import Demonstrations, check_time_limit
+from ccil_jax.agents.build import resolve
+from ccil_jax.agents.expert import expert_data
+from ccil_jax.config import Config, field_names, is_integer
+from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.errors import CheckpointError, ConfigError
 from ccil_jax.training import filesystem, guard
 from ccil_jax.training.checkpointing import Checkpointer
@@ -69,76 +70,6 @@ class Loaded:
 
     config: Config
     agent: Actor  # [num_seeds]-leading
-
-
-def resolve(config: Config, env: Environment, demonstrations: Demonstrations | None) -> Config:
-    """Checks that the pieces fit and sets the cost limit, before anything is compiled.
-
-    Raises:
-        ConfigError: options, environment and demonstrations do not fit together.
-        DemonstrationsError: an episode of the demonstrations is longer than the environment's.
-    """
-    validate(config)
-    if config.row.imitates:
-        if demonstrations is None:
-            raise ConfigError(f"method {config.method} needs demonstrations; pass some, or use method trpo or expert")
-        for name, array, size in (
-            ("obs", demonstrations.obs, env.obs_dim),
-            ("actions", demonstrations.actions, env.action_dim),
-        ):
-            if array.shape[1:] != (size,):
-                found = f"{array.shape[1]} columns" if array.ndim == 2 else f"shape {array.shape}, no rows,"
-                raise ConfigError(f"demonstrations: {name} has {found} but {env.name} has {size}")
-        check_time_limit(demonstrations, "demonstrations", env.max_episode_steps)
-    if demonstrations is not None:
-        config = with_limit_of(config, demonstrations.mean_episode_cost)
-    if (
-        config.method == "iq_learn"
-        and demonstrations is not None
-        and demonstrations.num_steps == len(demonstrations.episode_ends)
-        and not demonstrations.terminated.any()
-    ):
-        raise ConfigError(
-            "demonstrations: every trajectory is one step long and cut off, so no step's successor is known"
-        )
-    if config.method == "iq_learn" and config.temperature is None:
-        config = config.replace(temperature=iq_learn.TEMPERATURES.get(env.name, iq_learn.USUAL_TEMPERATURE))
-    return config
-
-
-def expert_data(demonstrations: Demonstrations | None) -> ExpertData | None:
-    """Demonstrations as device arrays; the last tenth of the steps is held out from the discriminator."""
-    if demonstrations is None:
-        return None
-    num_training = max(1, demonstrations.obs.shape[0] * 9 // 10)
-    held_out = slice(min(num_training, demonstrations.obs.shape[0] - 1), None)
-    return ExpertData(
-        obs=_real(demonstrations.obs[:num_training]),
-        action=_real(demonstrations.actions[:num_training]),
-        held_out_obs=_real(demonstrations.obs[held_out]),
-        held_out_action=_real(demonstrations.actions[held_out]),
-        transitions=expert_transitions(demonstrations),
-    )
-
-
-def expert_transitions(demonstrations: Demonstrations) -> ExpertTransitions:
-    """The steps whose successor is known: an episode's last step is one only where the task ended."""
-    ends, obs = demonstrations.episode_ends, demonstrations.obs
-    last = np.zeros(len(obs), bool)
-    last[ends - 1] = True
-    known = np.flatnonzero(~last | demonstrations.terminated)
-    return ExpertTransitions(
-        obs=_real(obs[known]),
-        action=_real(demonstrations.actions[known]),
-        next_obs=_real(obs[np.minimum(known + 1, len(obs) - 1)]),
-        terminated=_real(demonstrations.terminated[known]),
-        initial_obs=_real(obs[np.concatenate([[0], ends[:-1]])]),
-    )
-
-
-def _real(values: np.ndarray) -> jax.Array:
-    """As a device array of JAX's real numbers: float32, or float64 where the user has asked for that."""
-    return jnp.asarray(values, jnp.result_type(float))
 
 
 def train(

@@ -8,8 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from ccil_jax.config import CHOICES, PRESETS, Config, Use, validate
+from ccil_jax.config import CHOICES, Config, validate
 from ccil_jax.methods import METHODS
+from ccil_jax.presets import PRESETS
+from ccil_jax.uses import Use
 from envs import registry
 from envs.registry import PHYSICS, TASKS, TaskInfo
 from experiments.cli.command_line import Parser, UsageError, boolean, integer, natural, positive

@@ -16,10 +16,13 @@ from mujoco.batch import Batch as RawBatch
 import envs
 from ccil_jax import meshes
 from ccil_jax.acting import networks, rollout, running_statistics
-from ccil_jax.config import PRESETS, Config
+from ccil_jax.agents import build
+from ccil_jax.agents.expert import expert_data
+from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.learning import constraints, policy_step
-from ccil_jax.training import program, runner
+from ccil_jax.presets import PRESETS
+from ccil_jax.training import program
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
 from experiments.speed.turns import turn
@@ -223,8 +226,8 @@ def noise(env: Any, setting: Setting) -> Demonstrations:
 def training_work(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
     """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
     expert = noise(env, setting)
-    resolved = runner.resolve(config, env, expert)
-    compiled = program.compile_program(resolved, env, runner.expert_data(expert), setting.num_seeds)
+    resolved = build.resolve(config, env, expert)
+    compiled = program.compile_program(resolved, env, expert_data(expert), setting.num_seeds)
     state = compiled.init(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
 
     def work() -> int:

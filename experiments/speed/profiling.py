@@ -1,16 +1,21 @@
 """Where the time of an iteration goes: its parts, each compiled and timed by itself on the data that it has there."""
 
-from typing import Any
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import envs
-from ccil_jax.acting import networks, rollout
-from ccil_jax.agents import on_policy
-from ccil_jax.learning import constraints, policy_step, reward_models
-from ccil_jax.training import runner
+from ccil_jax.acting import rollout
+from ccil_jax.agents import build, on_policy
+from ccil_jax.agents.expert import expert_data
+from ccil_jax.agents.on_policy import AgentState, Parts
+from ccil_jax.learning import policy_step
+from ccil_jax.learning.policy_step import PolicyStep
+from ccil_jax.types import Batch, Transition
 from experiments.speed.measuring import (
     Setting,
     Work,
@@ -23,64 +28,73 @@ from experiments.speed.measuring import (
     wait,
 )
 
+PHYSICS = "physics alone"
 
-def profile(setting: Setting) -> dict[str, Any]:
-    """Microseconds per environment step, all seeds together, of each part, and their ratios to physics alone.
 
-    The parts are measured in turn, `rounds` times, and the ratios taken within a round; medians. `environment` steps
-    under the random actions that `physics alone` has; all else is what the policy of an untrained learner meets.
-    """
-    env: Any = envs.make(setting.task, physics=setting.physics)
-    demonstrations = noise(env, setting)
-    config = runner.resolve(make_config(setting), env, demonstrations)
-    expert = runner.expert_data(demonstrations)
-    num_seeds = setting.num_seeds
-    constraint = constraints.make(config)
-    policy = networks.make_policy(config, env.obs_dim, env.action_dim, on_policy.initial_std(env))
-    critic = networks.make_scalar(config, env.obs_dim)
-    reward_model = reward_models.task()
-    if config.row.reward == "discriminator":
-        assert expert is not None
-        network = networks.make_scalar(config, env.obs_dim + env.action_dim, final_scale=0.01)
-        reward_model = reward_models.discriminator(config, network, expert, env.obs_dim)
+class Pieces(NamedTuple):
+    """The parts of an iteration as functions of one seed; S of them are vmapped."""
+
+    walk: Callable[[AgentState, jax.Array], Any]  # state, actions [T, N, action_dim]: the environment alone
+    act: Callable[[AgentState, jax.Array], Any]  # state, key: a rollout
+    score: Callable[[AgentState, Transition], Batch]
+    split: Callable[[Batch, jax.Array], tuple[Batch, Batch]]  # samples, key -> held out, training
+    improve: Callable[[AgentState, Batch, Batch], Any]  # state, training, held out: a policy step
+    fit: Callable[[AgentState, Batch, jax.Array], Any]  # both critics
+    discriminate: Callable[[AgentState, Transition, jax.Array], Any]
+    constrain: Callable[[AgentState, PolicyStep], Any]  # the dual step, and the outer step where there is one
+
+
+def pieces_of(parts: Parts) -> Pieces:
+    """The pieces of `on_policy.step`, with a multiplier of 0.5 and no cost gap."""
+    config, env, policy, constraint = parts.config, parts.env, parts.policy, parts.constraint
     zero, multiplier = jnp.zeros(()), jnp.asarray(0.5)
 
-    def act(state: Any, key: jax.Array) -> Any:
-        return rollout.rollout(env, policy.apply, state.actor, state.rollout, config.num_steps, key)
-
-    def walk(state: Any, actions: jax.Array) -> Any:
+    def walk(state: AgentState, actions: jax.Array) -> Any:
         def step(env_state: Any, action: jax.Array) -> tuple[Any, Any]:
             env_state = jax.vmap(env.step)(env_state, action)
             return env_state, (env_state.obs, env_state.reward, env_state.cost)
 
         return jax.lax.scan(step, state.rollout.env_state, actions)
 
-    def score(state: Any, transition: Any) -> Any:
-        episodes = on_policy.episodes_of_steps(transition, zero, env.max_episode_steps)
-        return on_policy.assess(config, critic.apply, reward_model, constraint, state, transition, episodes)[0]
+    def act(state: AgentState, key: jax.Array) -> Any:
+        return rollout.rollout(env, policy.apply, state.actor, state.rollout, config.num_steps, key)
 
-    def split(samples: Any, key: jax.Array) -> Any:
+    def score(state: AgentState, transition: Transition) -> Batch:
+        samples, _ = on_policy.assess(parts, state, transition)
+        return samples
+
+    def split(samples: Batch, key: jax.Array) -> tuple[Batch, Batch]:
         return policy_step.split(samples, config.num_held_out, policy_step.random_order(config, key))
 
-    def improve(state: Any, training: Any, held_out: Any) -> Any:
+    def improve(state: AgentState, training: Batch, held_out: Batch) -> Any:
         params = state.actor.policy_params
         return policy_step.improve(config, policy.apply, constraint, params, training, multiplier, zero, held_out)
 
-    def fit(state: Any, training: Any, key: jax.Array) -> Any:
-        return on_policy.fit_critics(config, critic.apply, state.critics, training, key)
+    def fit(state: AgentState, training: Batch, key: jax.Array) -> Any:
+        return on_policy.fit_critics(parts, state.critics, training, key)
 
-    def discriminate(state: Any, transition: Any, key: jax.Array) -> Any:
-        return reward_model.update(state.reward_model, transition, key)
+    def discriminate(state: AgentState, transition: Transition, key: jax.Array) -> Any:
+        return parts.reward_model.update(state.reward_model, transition, key)
 
-    def outer(state: Any, taken: Any) -> Any:
+    def constrain(state: AgentState, taken: PolicyStep) -> Any:
         problem = policy_step.outer_problem(config, policy.apply, constraint, taken) if config.num_held_out else None
         return constraint.update(state.constraint, zero, problem)
 
+    return Pieces(walk, act, score, split, improve, fit, discriminate, constrain)
+
+
+def works(setting: Setting, env: Any) -> dict[str, Work]:
+    """What is timed, by name: each piece on the data that an untrained learner has there, for all seeds together."""
+    demonstrations = noise(env, setting)
+    config = build.resolve(make_config(setting), env, demonstrations)
+    parts = on_policy.make_parts(config, env, expert_data(demonstrations))
+    pieces, num_seeds = pieces_of(parts), setting.num_seeds
     keys = jax.random.split(jax.random.key(setting.seed), num_seeds)
-    state = spread(on_policy.make(config, env, expert).init, num_seeds)(keys)
-    transition = spread(act, num_seeds)(state, keys)[1]
-    held_out, training = spread(split, num_seeds)(spread(score, num_seeds)(state, transition), keys)
-    taken = spread(improve, num_seeds)(state, training, held_out)[1]
+    state = spread(functools.partial(on_policy.init, parts), num_seeds)(keys)
+    _, transition = spread(pieces.act, num_seeds)(state, keys)
+    samples = spread(pieces.score, num_seeds)(state, transition)
+    held_out, training = spread(pieces.split, num_seeds)(samples, keys)
+    _, taken, _ = spread(pieces.improve, num_seeds)(state, training, held_out)
     shape = (num_seeds, config.num_steps, config.num_envs, env.action_dim)
     low, high = jnp.asarray(env.action_low), jnp.asarray(env.action_high)
     actions = jax.random.uniform(jax.random.key(setting.seed), shape, minval=low, maxval=high)
@@ -96,33 +110,43 @@ def profile(setting: Setting) -> dict[str, Any]:
 
         return run
 
-    parts = {
-        "physics alone": physics_work(env, setting),
-        "environment": work(walk, batch, state, actions),
-        "rollout": work(act, batch, state, keys),
-        "reward, values, advantages": work(score, batch, state, transition),
-        "policy step": work(improve, batch, state, training, held_out),
-        "critics": work(fit, batch, state, training, keys),
-        "discriminator": work(discriminate, iteration, state, transition, keys),
-        "multiplier": work(outer, iteration, state, taken),
+    return {
+        PHYSICS: physics_work(env, setting),
+        "environment": work(pieces.walk, batch, state, actions),
+        "rollout": work(pieces.act, batch, state, keys),
+        "reward, values, advantages": work(pieces.score, batch, state, transition),
+        "policy step": work(pieces.improve, batch, state, training, held_out),
+        "critics": work(pieces.fit, batch, state, training, keys),
+        "discriminator": work(pieces.discriminate, iteration, state, transition, keys),
+        "multiplier": work(pieces.constrain, iteration, state, taken),
         "training": training_work(config, env, setting)[0],
     }
-    for run in parts.values():
+
+
+def profile(setting: Setting) -> dict[str, Any]:
+    """Microseconds per environment step, all seeds together, of each part, and their ratios to physics alone.
+
+    The parts are measured in turn, `rounds` times, and the ratios taken within a round; medians. `environment` steps
+    under the random actions that `physics alone` has; all else is what the policy of an untrained learner meets.
+    """
+    env: Any = envs.make(setting.task, physics=setting.physics)
+    timed = works(setting, env)
+    for run in timed.values():
         run()  # compiles, and warms caches
-    times = {name: np.zeros(setting.rounds) for name in parts}
+    times = {name: np.zeros(setting.rounds) for name in timed}
     for i in range(setting.rounds):
-        for name, run in parts.items():
+        for name, run in timed.items():
             times[name][i] = 1e6 / rate_of(run, setting.seconds)
     return {
         "task": setting.task,
         "physics": env.physics_name,
         "method": setting.method,
-        "num_seeds": num_seeds,
+        "num_seeds": setting.num_seeds,
         "num_envs": setting.num_envs,
         "parts": {
             name: {
                 "microseconds_per_step": float(np.median(values)),
-                "to_physics": float(np.median(values / times["physics alone"])),
+                "to_physics": float(np.median(values / times[PHYSICS])),
             }
             for name, values in times.items()
         },

@@ -1,103 +1,21 @@
-"""Our tasks for other libraries' learners, and other libraries' tasks for ours.
-
-* `GymnasiumVectorEnv(env, num_envs)`: ours as a `gymnasium.vector.VectorEnv`.
-* `to_brax(env)`: ours as a `brax.envs.Env`.
-* `FromBrax(env, cost)`: a Brax environment, or one of like form (MuJoCo Playground), with a cost function, as ours.
-"""
+"""Our tasks as Brax environments, and environments of Brax's form as ours."""
 
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 from envs.base import State, check_shape, executed, first_state, next_state
-from envs.jax_tools import compute_where
+from envs.costs import checked_cost
 from envs.options import check_count
+from envs.registry import physics_name
 
 BraxState = Any
-# Wrappers, by parts of their classes' names, after which a step no longer says how the episode goes on.
+# Parts of the names of wrappers' classes after which a step no longer says how the episode goes on.
 HIDING_WRAPPERS = ("AutoReset", "Episode", "Vmap", "Eval")
-
-
-class GymnasiumVectorEnv(VectorEnv):
-    """`num_envs` copies of one of our environments, reset in the step that ends an episode (`SAME_STEP`).
-
-    `info["cost"]` `[num_envs]` is the cost of the step just taken, also where the episode ended. There,
-    `info["final_obs"]` has the true successor and `info["final_info"]` cost, episode return and episode cost; as in
-    gymnasium, `info["_final_obs"]` marks those entries.
-
-    Args:
-        env: one of ours with `action_low` and `action_high`.
-        num_envs: copies, stepped as one batch.
-    """
-
-    def __init__(self, env: Any, num_envs: int):
-        check_count("num_envs", num_envs)
-        self.env, self.num_envs = env, num_envs
-        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-        self.render_mode = None
-        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (env.obs_dim,), np.float32)
-        low, high = (np.broadcast_to(x, env.action_dim).astype(np.float32) for x in (env.action_low, env.action_high))
-        self.single_action_space = gymnasium.spaces.Box(low, high, dtype=np.float32)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self._key: jax.Array | None = None
-        self._state: State | None = None
-        self._reset = jax.jit(self._start)
-        self._step = jax.jit(self._advance)
-
-    @jax.transfer_guard("allow")  # the caller has NumPy arrays
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts all episodes. The same `seed` gives the same episodes under the same actions."""
-        del options
-        if seed is not None or self._key is None:
-            self._key = jax.random.key(np.random.SeedSequence().generate_state(1)[0] if seed is None else seed)
-        self._key, self._state = self._reset(self._key)
-        return np.array(self._state.obs), {}
-
-    @jax.transfer_guard("allow")
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Advances all copies by one control step. Actions [num_envs, action_dim] are clipped to the action space."""
-        if self._state is None:
-            raise gymnasium.error.ResetNeeded("call reset before step")
-        check_shape(f"{self.env.name}: the actions", actions, (self.num_envs, self.env.action_dim))
-        self._key, self._state, taken = self._step(self._key, self._state, np.asarray(actions))
-        obs, last_obs, reward, cost, terminated, truncated, total, total_cost = map(np.array, taken)
-        done = terminated | truncated
-        info: dict[str, Any] = {"cost": cost, "_cost": np.ones(self.num_envs, bool)}
-        if done.any():
-            final_obs = np.full(self.num_envs, None, object)
-            for i in np.flatnonzero(done):
-                final_obs[i] = last_obs[i]
-            final = {"cost": cost, "episode_return": total, "episode_cost": total_cost}
-            info |= {"final_obs": final_obs, "_final_obs": done, "_final_info": done}
-            info["final_info"] = {name: np.where(done, value, 0.0) for name, value in final.items()}
-            info["final_info"] |= {f"_{name}": done for name in final}
-        return obs, reward.astype(np.float64), terminated, truncated, info
-
-    def _start(self, key: jax.Array) -> tuple[jax.Array, State]:
-        key, reset_key = jax.random.split(key)
-        return key, jax.vmap(self.env.reset)(jax.random.split(reset_key, self.num_envs))
-
-    def _advance(
-        self, key: jax.Array, state: State, actions: jax.Array
-    ) -> tuple[jax.Array, State, tuple[jax.Array, ...]]:
-        """The next key, the states to go on from, and what `step` tells of those and of the true successors."""
-        last = jax.vmap(self.env.step)(state, actions)
-        key, reset_key = jax.random.split(key)
-
-        def refresh(state: State, key: jax.Array) -> State:
-            return compute_where(state.done, self.env.reset, state, key)
-
-        state = jax.vmap(refresh)(last, jax.random.split(reset_key, self.num_envs))
-        totals = last.episode_return, last.episode_cost
-        return key, state, (state.obs, last.obs, last.reward, last.cost, last.terminated, last.truncated, *totals)
 
 
 def to_brax(env: Any) -> Any:
@@ -114,7 +32,7 @@ def to_brax(env: Any) -> Any:
 
         observation_size = env.obs_dim
         action_size = env.action_dim
-        backend = getattr(env, "physics_name", "unknown")
+        backend = physics_name(env)
         dt = getattr(env, "dt", None)
 
         def reset(self, rng: jax.Array) -> BraxState:
@@ -141,12 +59,9 @@ def to_brax(env: Any) -> Any:
 class FromBrax:
     """A Brax or Playground environment with a cost, as an `Environment` of ours.
 
-    Where an observation, reward or cost is NaN or infinite the episode terminates, as in our own tasks: nothing is
-    earned or paid, and what is not finite is shown as 0.
-
-    A negative cost is a mistake in `cost`, which nobody should train on. Called directly, `step` refuses it. A compiled
-    program cannot raise errors, so there the cost is NaN, which nothing that reads it can overlook: evaluations are
-    NaN, and training takes its updates back and stops (`Config.max_skipped_updates`).
+    Where an observation, reward or cost is NaN or infinite, the episode terminates, as in our own tasks: that step
+    earns and costs nothing, and what is not finite is shown as 0. A negative cost is refused, or NaN in a compiled
+    program: see `envs.costs.checked_cost`.
 
     Args:
         env: unwrapped, with actions in [-1, 1]. Its `done` is taken for termination.
@@ -200,20 +115,17 @@ class FromBrax:
         action = executed(self, action)
         new = self._env.step(state.physics, action)
         obs, reward = self._observe(new), self._scalar("reward", new.reward)
-        cost = self._scalar("cost", self._cost(state.physics, action, new))
-        negative = jnp.isfinite(cost) & (cost < 0)
-        if not isinstance(negative, jax.core.Tracer) and negative:
-            raise ValueError(f"{self.name}: the cost function returned {float(cost):g}; costs are 0 or more")
+        cost, finite = checked_cost(self.name, self._cost(state.physics, action, new))
         return next_state(
             state,
             physics=new,
             obs=obs,
             reward=reward,
-            cost=jnp.where(negative, jnp.nan, cost),
+            cost=cost,
             terminated=self._scalar("done", new.done) > 0.5,
             terms={"reward": reward},
             max_episode_steps=self.max_episode_steps,
-            finite=jnp.isfinite(obs).all() & jnp.isfinite(reward) & jnp.isfinite(cost),
+            finite=jnp.isfinite(obs).all() & jnp.isfinite(reward) & finite,
         )
 
     def _observe(self, state: BraxState) -> jax.Array:

@@ -1,0 +1,75 @@
+"""To whom each hyperparameter makes a difference, derived from the table of methods.
+
+A field of `Config` has one of these uses. From it follow the groups of options in `--help`, the note "used by ..." and
+the refusal of an option that would have no effect. `tests/test_config.py` compares the uses with the traced programs.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ccil_jax.methods import METHODS, Method
+
+if TYPE_CHECKING:
+    from ccil_jax.config import Config
+
+
+@dataclasses.dataclass(frozen=True)
+class Use:
+    """Which configurations a field matters to; to all others it makes no difference, so they refuse it."""
+
+    reads: Callable[[Method], bool]  # whether the method of a row reads the field
+    note: str = "{methods}"  # completes "used by ..."; {methods} stands for the names of those methods
+    where: Callable[["Config"], bool] = lambda config: True  # what other fields must hold besides
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods that read the field."""
+        return tuple(name for name, row in METHODS.items() if self.reads(row))
+
+    @property
+    def who(self) -> str:
+        """Completes "used by ..."."""
+        return self.note.format(methods=", ".join(self.methods))
+
+    def holds(self, config: "Config") -> bool:
+        """Whether the field matters to `config`."""
+        return self.reads(config.row) and self.where(config)
+
+
+ALL = Use(lambda row: True, "every method")
+ACTING = Use(lambda row: row.agent != "behavior_cloning", "every method that acts while it learns: all but bc")
+ON_POLICY = Use(lambda row: row.agent == "on_policy", "every on-policy method: all but bc and iq_learn")
+ADVERSARIAL = Use(lambda row: row.reward == "discriminator", "methods with a discriminator ({methods})")
+PENALIZED = Use(
+    ADVERSARIAL.reads,
+    "methods with a discriminator whose discriminator_regularizer is gradient_penalty",
+    lambda config: config.discriminator_regularizer == "gradient_penalty",
+)
+CONSTRAINED = Use(lambda row: row.limit is not None, "methods in which the cost enters ({methods})")
+LIMITED = Use(lambda row: row.limit == "prescribed", "methods with a prescribed limit ({methods})")
+LAGRANGIAN = Use(
+    lambda row: row.constraint in ("lagrangian", "meta_lagrangian"), "methods with a choice of multiplier ({methods})"
+)
+ASCENT = Use(
+    LAGRANGIAN.reads,
+    "{methods} whose multiplier_update is adam or sgd",
+    lambda config: config.multiplier_update in ("adam", "sgd"),
+)
+PID = Use(
+    lambda row: row.constraint in ("lagrangian", "meta_lagrangian", "pid"),
+    "pid_il, and methods with a choice of multiplier whose multiplier_update is pid ({methods})",
+    lambda config: config.row.constraint == "pid" or config.multiplier_update == "pid",
+)
+MULTIPLIER = Use(
+    PID.reads,
+    "pid_il, and methods with a choice of multiplier unless multiplier_update is optimal ({methods})",
+    lambda config: config.has_multiplier,
+)
+MALM = Use(lambda row: row.constraint == "meta_lagrangian")
+HELD_OUT = Use(MALM.reads, "{methods} whose held_out_fraction is above 0", lambda config: config.held_out_fraction > 0)
+META = Use(MALM.reads, "{methods} unless meta_gradient is none", lambda config: config.meta_gradient != "none")
+CVAG = Use(lambda row: row.constraint == "alternating")
+BC = Use(lambda row: row.agent == "behavior_cloning")
+IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
+OFF_POLICY = Use(lambda row: row.agent in ("behavior_cloning", "iq_learn"))
