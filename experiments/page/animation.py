@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.registry import TASKS
 from experiments.page import top_down
-from experiments.policies.original_simulator import NumpyPolicy, policies
+from experiments.policies.numpy_policy import NumpyPolicy, policies
 from experiments.runs import figures
 from experiments.runs.run_folder import Run
 
