@@ -15,7 +15,7 @@ from typing import Any
 from ccil_jax.config import Config
 from ccil_jax.methods import METHODS
 from ccil_jax.presets import PRESETS
-from envs.registry import PHYSICS
+from envs.registry import PHYSICS, TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
@@ -85,7 +85,7 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         options.config_from(chosen, arguments.preset, {"cost_limit": 0.0, **changes[num_envs]})
     return [
         {
-            "task": options.find_task(task, "--tasks").name,
+            "task": _find_task(task).name,
             "physics": physics,
             "method": arguments.method,
             "num_seeds": num_seeds,
@@ -101,6 +101,13 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         for num_seeds in arguments.num_seeds
         for num_envs in arguments.num_envs
     ]
+
+
+def _find_task(name: str) -> TaskInfo:
+    task = options.find_task(name, "--tasks")
+    if not options.has_option(task, "physics"):
+        raise UsageError(f"--tasks {name}: takes no physics, so there is no engine to compare it with; see `growth`")
+    return task
 
 
 def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser
+from experiments.cli.names import safe_name
 from experiments.page import document
 from experiments.page.entries import read_entries
 
@@ -34,7 +35,7 @@ def make_parser() -> Parser:
 
 
 def _figure(folder: Path, task: str) -> Path:
-    return folder / f"{Path(task).name}.png"  # a name from a file does not choose the folder
+    return folder / f"{safe_name(task)}.png"
 
 
 def run(arguments: argparse.Namespace) -> None:

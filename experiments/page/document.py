@@ -223,10 +223,13 @@ def _text(value: str) -> str:
 
 
 def animate(entry: Entry) -> str:
-    """The HTML of an episode of the seed with the highest return, or an empty string for a run without checkpoints."""
-    if not (entry.run.folder / "checkpoints").is_dir():
+    """The HTML of an episode of the seed with the highest return.
+
+    It is empty for a run without checkpoints, and for a task that cannot be drawn or is not known here.
+    """
+    if not (entry.run.folder / "checkpoints").is_dir() or entry.view is None:
         return ""
-    from experiments.page import animation  # imports JAX: only where an episode is asked for
+    from experiments.page import animation  # imports JAX, which a page without episodes does not need
 
     best, caption = choose_seed(entry)
     return animation.play_run(entry.run, best, f"episode-{entry.number}", caption)
