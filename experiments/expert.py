@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
     trained = run_folder.read_run(plan.folder)
     demonstrations = record(
         outcome.result.config,
-        outcome.result.agent,
+        outcome.result.actor,
         outcome.env,
         num_trajectories=arguments.num_trajectories,
         episode_seed=(plan.setup.evaluation_seed + 1) % 2**32,

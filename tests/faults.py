@@ -323,9 +323,9 @@ def child(launcher: str, arguments: Sequence[str]) -> int:
 
     envs.register("Walk", make_walk, obs_dim=2, action_dim=1)
 
-    from ccil_jax.training import runner
+    from ccil_jax.training import loop
 
-    runner.CHECKPOINT_SECONDS, runner.SAVING_SHARE, runner.CHUNK_SECONDS = 0.3, 1.0, 0.0
+    loop.CHECKPOINT_SECONDS, loop.SAVING_SHARE, loop.CHUNK_SECONDS = 0.3, 1.0, 0.0
     for number in (signal.SIGTERM, signal.SIGUSR1):  # sent here, even if whoever runs this began with them ignored
         signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -43,7 +43,7 @@ def clone(demonstrations: Demonstrations, num_seeds: int = 1, **changes: Any) ->
 def test_it_finds_the_mean_and_the_deviation_of_a_gaussian_expert() -> None:
     demonstrations = linear_expert(4000)
     result = clone(demonstrations, bc_epochs=40, actor_learning_rate=3e-3)
-    actor = jax.tree.map(lambda leaf: leaf[0], result.agent)
+    actor = jax.tree.map(lambda leaf: leaf[0], result.actor)
     mean, log_std = numpy_policy(actor.policy_params, normalize(actor.obs_statistics, jnp.asarray(demonstrations.obs)))
     truth = 0.1 + demonstrations.obs @ SLOPE
     common = np.abs(demonstrations.obs).max(axis=1) < 2
@@ -90,4 +90,4 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
     assert same_bits(resumed.state, whole.state)
     assert all(same_bits(resumed.metrics[name], rows) for name, rows in whole.metrics.items())
     loaded = runner.load(walk_config(method="bc", bc_epochs=20), Walk(), tmp_path, 2)
-    assert same_bits(loaded.agent, whole.agent)
+    assert same_bits(loaded.actor, whole.actor)

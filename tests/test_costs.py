@@ -88,7 +88,7 @@ def test_costs_of_costs() -> None:
     outer = envs.with_cost(env, lambda before, action, after: after.cost + 1)
     state = outer.step(outer.reset(jax.random.key(0)), jnp.zeros(1))
     state = outer.step(state, jnp.zeros(1))
-    assert (state.cost, state.episode_cost) == (21.0, 42.0)
+    assert [float(x) for x in (state.cost, state.episode_cost)] == [21.0, 42.0]
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -97,8 +97,10 @@ def test_a_cost_that_is_not_finite_ends_the_episode(value: float) -> None:
     first = env.step(env.reset(jax.random.key(0)), jnp.zeros(1))
     second = env.step(first, jnp.zeros(1))
     assert [bool(state.terminated) for state in (first, second)] == [False, True]
-    assert (first.cost, first.episode_cost, second.cost, second.episode_cost) == (3.0, 3.0, 0.0, 3.0)
-    assert (second.reward, second.episode_return) == (0.0, first.episode_return)
+    costs = (first.cost, first.episode_cost, second.cost, second.episode_cost)
+    assert [float(x) for x in costs] == [3.0, 3.0, 0.0, 3.0]
+    assert second.reward == 0.0
+    assert second.episode_return == first.episode_return
     assert np.isfinite(second.obs).all()
 
 

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import pytest
 
-from ccil_jax.training import runner
-from ccil_jax.training.runner import Progress
+from ccil_jax.training import loop, runner
+from ccil_jax.training.loop import Progress
 from tests import faults
 from tests.faults import Suite
 from tests.probe_envs import Walk, quick_compilation, walk_config
@@ -52,7 +52,7 @@ def test_long_runs_do_not_grow(num_iterations: int, tmp_path: Path, monkeypatch:
 
     Checkpoints are part of it, one a second.
     """
-    monkeypatch.setattr(runner, "CHECKPOINT_SECONDS", 1.0)
+    monkeypatch.setattr(loop, "CHECKPOINT_SECONDS", 1.0)
     seen: list[tuple[int, float, int]] = []
     compiled: list[str] = []
 
@@ -83,7 +83,7 @@ def test_long_runs_do_not_grow(num_iterations: int, tmp_path: Path, monkeypatch:
 def test_counters_pass_31_bits() -> None:
     config = walk_config(batch_size=2**20, num_envs=2**10, generator_steps=1)
     first = 2**31 // 2**20 - 2
-    rows = runner._rows({"kl": np.zeros((2, 4))}, first, config)
+    rows = loop._rows({"kl": np.zeros((2, 4))}, first, config)
     assert rows["env_steps"].dtype == np.int64
     assert rows["env_steps"].tolist() == [[2**31 + k * 2**20] * 2 for k in (-1, 0, 1, 2)]
 

@@ -113,7 +113,7 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(whole: runner.Result, tmp
     assert same_bits(resumed.state, whole.state)
     assert all(same_bits(resumed.metrics[name], rows) for name, rows in whole.metrics.items())
     loaded = runner.load(iq_config(env_steps=20 * 32), Walk(), tmp_path, 2)
-    assert same_bits(loaded.agent, whole.agent)
+    assert same_bits(loaded.actor, whole.actor)
 
 
 def test_it_learns_from_every_step(whole: runner.Result) -> None:

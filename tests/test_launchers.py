@@ -245,14 +245,14 @@ def test_exported_policies_are_the_learnt_ones(
 
     @jax.jit
     def learnt(obs: jax.Array, noise: jax.Array) -> jax.Array:
-        return jax.vmap(lambda actor: act(policy.apply, actor, obs, noise))(loaded.agent)
+        return jax.vmap(lambda actor: act(policy.apply, actor, obs, noise))(loaded.actor)
 
     expected = np.asarray(learnt(jnp.asarray(obs), jnp.asarray(noise)))
     assert expected.shape == (2, 1000, env.action_dim)
     np.testing.assert_array_equal(program.call(obs, noise), expected)
     assert program.call(obs[:7], noise[:7]).shape == (2, 7, env.action_dim)
 
-    modes = np.stack([[one.mode(x) for x in obs] for one in policies(stored.config, loaded.agent, env)])
+    modes = np.stack([[one.mode(x) for x in obs] for one in policies(stored.config, loaded.actor, env)])
     np.testing.assert_allclose(modes, program.call(obs, 0 * noise), rtol=0, atol=1e-5)
     with np.load(files[0], allow_pickle=False) as arrays:
         assert arrays["kernel_0"].shape == (2, env.obs_dim, *stored.config.hidden_sizes[:1])

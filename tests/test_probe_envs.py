@@ -122,7 +122,7 @@ def test_the_multiplier_settles_where_the_kkt_conditions_put_it() -> None:
     gaps = result.metrics["episode_cost"][-100:] - COST_LIMIT
     assert (gaps.min(axis=0) < 0).all()
     assert (gaps.max(axis=0) > 0).all()
-    policy = result.agent.policy_params
+    policy = result.actor.policy_params
     np.testing.assert_allclose(np.exp(policy["log_std"][:, 0]), DEVIATION, rtol=0.2)
 
 

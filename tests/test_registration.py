@@ -11,6 +11,7 @@ import pytest
 import envs
 from envs import engines, lookup, registry
 from envs.registry import TASKS
+from envs.task_info import physics_name
 from envs.testing import check_environment
 from tests.probe_envs import Counter, Walk
 
@@ -178,8 +179,8 @@ def test_a_function_in_the_current_folder_is_a_task(module: Module) -> None:
     assert text not in envs.TASKS
     env = envs.make(text, max_episode_steps=7, options={"width": 5})
     assert (env.name, env.max_episode_steps) == ("Walk5", 7)
-    assert registry.physics_name(env) == "by hand"
-    assert registry.physics_name(Walk()) == "Walk"
+    assert physics_name(env) == "by hand"
+    assert physics_name(Walk()) == "Walk"
     check_environment(env, num_steps=5)
     for given, message in (
         ({"physics": "mjx"}, "their_tasks:make: physics 'mjx' has no effect"),

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config
 from ccil_jax.errors import ConfigError
-from ccil_jax.training import runner
+from ccil_jax.training import combining, program, runner
 from ccil_jax.training.history import EPISODE_ESTIMATES, without_unknown
 from ccil_jax.training.program import compile_program
 from ccil_jax.training.runner import Result
+from envs.base import Environment
 from experiments.cli import xla
 from tests.probe_envs import Counter, Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
@@ -83,7 +85,7 @@ def test_stopped_and_resumed_together(results: list[Result], tmp_path: Path) -> 
         assert same_bits((result.state, result.metrics), (same.state, same.metrics))
         runner.save(result, tmp_path / str(i))
         loaded = runner.load(result.config, Walk(), tmp_path / str(i), NUM_SEEDS)
-        assert same_bits(loaded.agent, result.agent)
+        assert same_bits(loaded.actor, result.actor)
 
 
 @pytest.mark.parametrize(
@@ -147,17 +149,65 @@ def values_of(program: Any) -> Iterator[Any]:
                 yield from values_of(getattr(inner, "jaxpr", inner))
 
 
+def test_verbose_shows_the_progress_on_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    """Not a terminal here, so that there is a line at the end. `on_progress` sees every chunk all the same."""
+    seen: list[int] = []
+    small = walk_config(method="trpo", env_steps=2 * 64)
+    with quick_compilation():
+        for verbose in (False, True):
+            runner.train(small, Walk(), verbose=verbose, on_progress=lambda progress: seen.append(progress.iteration))
+            out, err = capsys.readouterr()
+            assert out == ""
+            assert bool(err) == verbose
+    assert seen[-1] == 2
+    assert seen[: len(seen) // 2] == seen[len(seen) // 2 :]
+    compiled, last = err.splitlines()
+    assert re.fullmatch(r"compiled in \d+\.\d s", compiled)
+    assert re.fullmatch(r"trpo Walk 2/2  return \S+  cost \S+  [\d,]+ steps/s.*", last)
+
+
+def test_the_limit_is_shown_where_all_configurations_have_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    train(*CHOICES[:1], stop_after=1, verbose=True)  # one line, at the end of the training: not reached here
+    assert capsys.readouterr().err.splitlines()[1:] == []
+    for choices, shown in ((CHOICES[:1], "cost 2.00 / 1.00  lambda"), (CHOICES[:2], "cost 2.00  lambda")):
+        train(*choices, verbose=True)
+        assert shown in re.sub(r"cost \S+", "cost 2.00", capsys.readouterr().err)
+
+
+def test_no_chunk_is_traced_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One trace of the program and one of an iteration serve chunks of all lengths."""
+    chex.clear_trace_counter()
+    iteration = program._iteration
+
+    def counted(env: Environment) -> program.Iteration:
+        traced = iteration(env).__wrapped__  # type: ignore[attr-defined]  # the function that is jitted
+        return jax.jit(chex.assert_max_traces(traced, n=1))
+
+    monkeypatch.setattr(program, "_iteration", counted)
+    monkeypatch.setattr(program, "_run_chunk", chex.assert_max_traces(program._run_chunk, n=1))
+    lengths = []
+    with quick_compilation():
+        runner.train(
+            walk_config(method="trpo"), Walk(), on_progress=lambda p: lengths.append(len(p.metrics["env_steps"]))
+        )
+    assert sum(lengths) == 20
+    assert len(lengths) > 2
+    assert len(set(lengths)) > 1
+    with quick_compilation(), pytest.raises(AssertionError, match="traced > 1 times"):
+        runner.train(walk_config(method="trpo"), Walk())  # a program of its own: the counters do count
+
+
 def test_only_traced_fields_may_differ() -> None:
     with pytest.raises(ConfigError, match="hidden_sizes"):
         runner.train_runs([walk_config(method="trpo"), walk_config(method="trpo", hidden_sizes=(5,))], Walk())
 
 
 def test_fields_that_agree_stay_numbers() -> None:
-    shared, varied = runner.join([config(1.0, 0.1, 0.0), config(1.0, 0.2, 0.0)], num_seeds=2)
+    shared, varied = combining.join([config(1.0, 0.1, 0.0), config(1.0, 0.2, 0.0)], num_seeds=2)
     assert shared.cost_limit == 1.0
     assert list(varied) == ["multiplier_learning_rate"]
     np.testing.assert_array_equal(varied["multiplier_learning_rate"], np.float32([0.1, 0.1, 0.2, 0.2]))
-    assert runner.join([config(1.0, 0.1, 0.0)] * 2, num_seeds=2)[1] == {}
+    assert combining.join([config(1.0, 0.1, 0.0)] * 2, num_seeds=2)[1] == {}
     assert isinstance(varied["multiplier_learning_rate"], jax.Array)
 
 
@@ -166,7 +216,7 @@ import json, sys, jax
 from ccil_jax.acting import evaluation
 from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
-from ccil_jax.training import runner
+from ccil_jax.training import combining, runner
 from ccil_jax.training.program import compile_program
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
@@ -176,7 +226,7 @@ configs = [
     build.resolve(walk_config(method=sys.argv[1], critic_learning_rate=rate), env, demonstrations)
     for rate in (0.01, 0.02, 0.05)
 ]
-shared, varied = runner.join(configs, num_seeds=2)
+shared, varied = combining.join(configs, num_seeds=2)
 single = [compile_program(configs[0], env, expert, num_runs, one_by_one=True) for num_runs in (1, 5)]
 together = compile_program(shared, env, expert, 6, varied=varied, one_by_one=True)
 with quick_compilation():

@@ -111,7 +111,7 @@ def test_training_makes_no_nan_and_no_transfer_that_was_not_meant() -> None:
     config = walk_config(method="malm", env_steps=2 * 64)
     with quick_compilation(), jax.debug_nans(True), jax.transfer_guard("disallow"):
         result = ccil_jax.train(config, Walk(), walk_demonstrations())
-        found = ccil_jax.evaluate(result.config, result.agent, Walk(), num_episodes=3)
+        found = ccil_jax.evaluate(result.config, result.actor, Walk(), num_episodes=3)
     assert result.metrics["skipped_updates"].max() == 0
     assert found.episode_length.shape == (1, 3)
 

@@ -254,7 +254,7 @@ def checkpoints_agree_with_metrics(out: Path) -> None:
     for folder in out.glob("runs/*"):
         run = run_folder.read_run(folder)
         env = envs.make("Swimmer", **run.facts["env_options"])
-        assert jax.tree.leaves(runner.load(run.config, env, folder / "checkpoints", 2).agent)
+        assert jax.tree.leaves(runner.load(run.config, env, folder / "checkpoints", 2).actor)
         saved = manifests.read(folder / "checkpoints" / "2")["arrays"]
         metrics = run_folder.read_metrics(folder)
         assert {name for name in saved if name.startswith("history.")} == {f"history.{name}" for name in metrics}
@@ -274,7 +274,7 @@ def test_a_run_that_another_program_left_is_set_aside_whole(tmp_path: Path) -> N
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1"]
     runner.save(new, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "1.replaced"]
-    assert same_bits(runner.load(new.config, Walk(), tmp_path, 1).agent, new.agent)
+    assert same_bits(runner.load(new.config, Walk(), tmp_path, 1).actor, new.actor)
 
 
 def test_a_stopped_sweep_starts_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

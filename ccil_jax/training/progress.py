@@ -57,7 +57,7 @@ class Display:
         self._console.print(text, highlight=False)
 
     def update(self, progress: Any) -> None:
-        """Shows the state after a chunk of iterations, a `ccil_jax.training.runner.Progress`."""
+        """Shows the state after a chunk of iterations, a `ccil_jax.training.loop.Progress`."""
         now = time.monotonic()
         if self._first_iteration is None:
             self._first_iteration, self._started = progress.iteration, now

@@ -1,11 +1,10 @@
-"""Training: the loop that logs and checkpoints between chunks of the compiled program."""
+"""Trainings: from a configuration, an environment and demonstrations to trained policies, in memory or on disk."""
 
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,62 +13,47 @@ import numpy as np
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents.build import resolve
 from ccil_jax.agents.expert import expert_data
-from ccil_jax.config import Config, field_names, is_integer
+from ccil_jax.config import Config, field_names
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.errors import CheckpointError, ConfigError
-from ccil_jax.training import filesystem, guard
+from ccil_jax.training import filesystem, loop
 from ccil_jax.training.checkpointing import Checkpointer
+from ccil_jax.training.combining import columns, join
 from ccil_jax.training.guard import GuardedState
-from ccil_jax.training.history import without_unknown
+from ccil_jax.training.loop import History, Progress, Snapshot
 from ccil_jax.training.manifests import Identity, identity_of
-from ccil_jax.training.program import Program, compile_program, make_agent
+from ccil_jax.training.program import Program, compile_program, guarded_agent
+from ccil_jax.training.progress import Display
+from ccil_jax.training.settings import Settings
 from ccil_jax.types import ExpertData, ExpertTransitions
 from envs.base import Environment
-
-CHECKPOINT_SECONDS = 60.0  # about this much work is lost with a killed process
-SAVING_SHARE = 0.02  # of the time: large states are saved less often
-CHUNK_SECONDS = 1.0  # between two looks from Python, unless one iteration takes longer
-
-History = dict[str, np.ndarray]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Progress:
-    """What `on_progress` sees after every chunk."""
-
-    iteration: int  # finished so far
-    num_iterations: int
-    metrics: History  # the new rows, [chunk, num_runs] each; NaN for what is not known yet
-    env_steps_per_second: float  # of this chunk, all runs together
-    compile_seconds: float
-    stopped: np.ndarray  # [num_seeds] bool: seeds given up, after too many iterations in a row that were not finite
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Result:
-    """A finished (or stopped) run."""
+    """A run that is finished or was stopped: `num_seeds` seeds of one configuration."""
 
-    config: Config  # as resolved: the demonstrations' cost limit is set
-    identity: Identity  # of this configuration's runs
-    metrics: History  # [iterations, num_seeds] each; {} before the first
+    config: Config  # as resolved: the cost limit is set, from the demonstrations where the method says so
+    identity: Identity  # which training this is
+    metrics: History  # [iterations, num_seeds] each; {} before the first iteration
     state: GuardedState  # [num_seeds]-leading
     env_steps: int  # per seed
     compile_seconds: float
     wall_seconds: float  # of this call, compilation included
-    stopped: np.ndarray  # [num_seeds] bool, as in `Progress`
+    stopped: np.ndarray  # [num_seeds] bool: seeds that were given up, see `guard.protect`
 
     @property
-    def agent(self) -> Actor:
-        """Policies and observation statistics, [num_seeds]-leading, on one device."""
+    def actor(self) -> Actor:
+        """The policies and their observation statistics, [num_seeds]-leading, on one device."""
         return jax.device_put(self.state.actor, jax.local_devices()[0])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Loaded:
-    """A trained agent from disk."""
+    """Trained policies from disk."""
 
     config: Config
-    agent: Actor  # [num_seeds]-leading
+    actor: Actor  # [num_seeds]-leading
 
 
 def train(
@@ -83,6 +67,7 @@ def train(
     checkpoint_dir: str | Path | None = None,
     resume: bool = False,
     moved: Collection[str] = (),
+    verbose: bool = False,
     on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -91,28 +76,32 @@ def train(
     """Trains `config.method` with `num_seeds` seeds in one vmapped program.
 
     Args:
-        config: hyperparameters; its cost limit is taken from the demonstrations where the method says so.
+        config: hyperparameters; the cost limit is taken from the demonstrations where the method says so.
         env: one environment, unbatched.
-        demonstrations: needed by the imitation methods.
+        demonstrations: needed by the methods that imitate.
         num_seeds: S.
-        seed: of the S keys; the same seed and S give the same bits.
-        one_by_one: each device takes its seeds in turn. Then a seed's bits depend neither on how many seeds there are
-            nor on how many devices.
-        checkpoint_dir: where whole-state checkpoints go, about once a minute and at the end.
-        resume: continue from the newest intact checkpoint in `checkpoint_dir`, of the same training; begin where there
-            is none. Without it, a folder with checkpoints is refused.
+        seed: of the S random keys; the same seed and S give the same bits on the same machine.
+        one_by_one: each device carries out its seeds one after the other. Then the bits of a seed depend neither on how
+            many seeds there are nor on how many devices.
+        checkpoint_dir: where checkpoints of the whole state are saved, about once a minute and at the end.
+        resume: go on from the newest intact checkpoint in `checkpoint_dir`, which must be of the same training; begin
+            anew where there is none. Without it, a folder that holds checkpoints is refused.
         moved: names of traced fields that may differ from those of the training that is resumed.
-        on_start: called once, before the first iteration, with the metrics of those that are done ({} if none is).
-        on_progress: called after every chunk of iterations.
-        should_stop: asked after every chunk; once true, the state is saved and the result so far is returned.
-        stop_after: stop once this many iterations are done, to be resumed later; 0 takes no step at all.
+        verbose: show the progress on standard error: a live bar on a terminal, else a line about every ten seconds.
+        on_start: is called once, before the first iteration of this call, with the metrics of the iterations that were
+            done before ({} if there are none).
+        on_progress: is called after every chunk of iterations.
+        should_stop: is asked after every chunk of iterations. Once it returns true, the state is saved and the result
+            so far is returned.
+        stop_after: stop once this many iterations are done in all, to be resumed later; 0 takes no step at all.
 
     Raises:
-        ConfigError: options, environment and demonstrations do not fit together; or the checkpoints are damaged, those
-            of another training, in use by another process, or cannot be written.
+        ConfigError: options, environment and demonstrations do not fit together.
+        CheckpointError: the checkpoints are damaged, are of another training, or cannot be written.
+        LockedError: another process uses `checkpoint_dir`.
         DemonstrationsError: an episode of the demonstrations is longer than the environment's.
     """
-    return train_runs(
+    (result,) = train_runs(
         [config],
         env,
         demonstrations,
@@ -122,14 +111,15 @@ def train(
         checkpoint_dir=checkpoint_dir,
         resume=resume,
         moved=moved,
+        verbose=verbose,
         on_start=on_start,
         on_progress=on_progress,
         should_stop=should_stop,
         stop_after=stop_after,
-    )[0]
+    )
+    return result
 
 
-@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
 def train_runs(
     configs: Sequence[Config],
     env: Environment,
@@ -141,6 +131,7 @@ def train_runs(
     checkpoint_dir: str | Path | None = None,
     resume: bool = False,
     moved: Collection[str] = (),
+    verbose: bool = False,
     on_start: Callable[[History], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
@@ -148,151 +139,130 @@ def train_runs(
 ) -> list[Result]:
     """Trains several configurations that differ in traced fields alone, each with the same seeds, in one program.
 
-    Its runs are [len(configs) * num_seeds], configuration after configuration: that is the order of the columns that
-    `on_progress` sees and of the states in a checkpoint. All else is as in `train`. Returns one result for each.
+    The program has [len(configs) * num_seeds] runs, configuration by configuration. This is the order of the columns
+    that `on_progress` sees and of the states in a checkpoint. Everything else is as in `train`.
+
+    Returns:
+        One result for each configuration.
 
     Raises:
         ConfigError: also where the configurations differ in a static field.
     """
+    settings = Settings(
+        num_seeds=num_seeds,
+        seed=seed,
+        one_by_one=one_by_one,
+        checkpoint_dir=checkpoint_dir,
+        resume=resume,
+        moved=moved,
+        verbose=verbose,
+        on_start=on_start,
+        on_progress=on_progress,
+        should_stop=should_stop,
+        stop_after=stop_after,
+    )
+    return _train(configs, env, demonstrations, settings)
+
+
+@jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose
+def _train(
+    configs: Sequence[Config], env: Environment, demonstrations: Demonstrations | None, settings: Settings
+) -> list[Result]:
+    """Checks everything, opens what is written to, compiles, begins or restores, goes on to the end."""
     start = time.perf_counter()
     if not configs:
         raise ConfigError("configs: give at least one configuration")
-    _check_integer("num_seeds", num_seeds, 1)
-    _check_integer("seed", seed, 0, 2**32 - 1)
-    _check_integer("stop_after", 0 if stop_after is None else stop_after, 0)
-    for name, value in (("one_by_one", one_by_one), ("resume", resume)):
-        if not isinstance(value, bool):
-            raise ConfigError(f"{name} {value!r}: give True or False")
-    if resume and checkpoint_dir is None:
-        raise ConfigError("resume True: there is nothing to go on from; give checkpoint_dir")
-    if moved and not resume:
-        raise ConfigError(f"moved {', '.join(moved)}: for a training that is resumed; leave it out, or add resume=True")
-    if static := set(moved) - set(field_names(traced=True)):
-        raise ConfigError(f"moved {min(static)}: only a traced field may differ from the training that is resumed")
-    checkpoint_dir = None if checkpoint_dir is None else Path(checkpoint_dir)
     configs = [resolve(config, env, demonstrations) for config in configs]
-    config, varied = join(configs, num_seeds)
-    num_runs = len(configs) * num_seeds
-    last = config.num_iterations if stop_after is None else min(stop_after, config.num_iterations)
-    identity = identity_of(configs, env, demonstrations, num_seeds, seed)
-
+    shared, varied = join(configs, settings.num_seeds)
+    identity = identity_of(configs, env, demonstrations, settings.num_seeds, settings.seed)
     with contextlib.ExitStack() as stack:
-        checkpoints = None
-        if checkpoint_dir:
-            stack.enter_context(filesystem.hold(checkpoint_dir / ".writer.lock"))
-            checkpoints = stack.enter_context(Checkpointer(checkpoint_dir, identity, free=frozenset(moved)))
-            if not resume:
-                checkpoints.check_empty()
-        found = checkpoints.latest_step() if checkpoints else None
-        if checkpoints and found:
-            checkpoints.check_identity(found)  # compiling takes longer
-            if found > config.num_iterations:
-                raise ConfigError(
-                    f"env_steps {config.env_steps}: the training in {checkpoint_dir} has done "
-                    f"{found * config.steps_per_iteration}; give at least as many"
-                )
+        checkpoints = stack.enter_context(_opened_checkpoints(settings, identity))
+        found = None if checkpoints is None else _step_to_resume(checkpoints, shared, settings)
+        observers = [] if settings.on_progress is None else [settings.on_progress]
+        if settings.verbose:
+            observers.append(stack.enter_context(_display(configs, env)).update)
         program = compile_program(
-            config, env, expert_data(demonstrations), num_runs, varied=varied, one_by_one=one_by_one
+            shared,
+            env,
+            expert_data(demonstrations),
+            len(configs) * settings.num_seeds,
+            varied=varied,
+            one_by_one=settings.one_by_one,
         )
-        if checkpoints and found:
-            done, (state, history) = found, _restore(checkpoints, found, program)
-            history = without_unknown(history)
-            if not config.has_multiplier:
-                history.pop("multiplier", None)  # an earlier version logged 0 for methods that have none
+        if checkpoints is None or found is None:
+            snapshot = _first(program, shared, settings, len(configs))
         else:
-            keys = jnp.tile(jax.random.split(jax.random.key(seed), num_seeds), len(configs))
-            done, state, history = 0, program.init(keys), {}
-        if on_start:
-            on_start(history)
-        stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
-        saved_at, saving, length = time.perf_counter(), 0.0, 1
-        while done < last and not stopped.all():
-            chunk_start = time.perf_counter()
-            length = min(length, last - done)
-            state, metrics = program.chunk(state, length)
-            # Cut on the host: a slice on the device would be compiled for every length.
-            rows = _rows({name: np.asarray(value)[:, :length] for name, value in metrics.items()}, done, config)
-            stopped = np.asarray(guard.stopped(state, config.max_skipped_updates))
-            elapsed = time.perf_counter() - chunk_start
-            history = {name: np.concatenate([history[name], row]) if history else row for name, row in rows.items()}
-            history = without_unknown(history)
-            rows = {name: values[-length:] for name, values in history.items()}
-            done += length
-            stop = done >= last or bool(stopped.all()) or (should_stop is not None and should_stop())
-            due = time.perf_counter() - saved_at > max(CHECKPOINT_SECONDS, saving / SAVING_SHARE)
-            if checkpoints and (stop or due):
-                saving_start = time.perf_counter()
-                checkpoints.save(done, {"state": state, "history": history})
-                saved_at = time.perf_counter()
-                saving = saved_at - saving_start
-            if on_progress:
-                on_progress(
-                    Progress(
-                        iteration=done,
-                        num_iterations=config.num_iterations,
-                        metrics=rows,
-                        env_steps_per_second=length * config.steps_per_iteration * num_runs / elapsed,
-                        compile_seconds=program.compile_seconds,
-                        stopped=stopped,
-                    )
-                )
-            if stop:
-                break
-            length = max(1, min(program.chunk_length, int(CHUNK_SECONDS * length / elapsed)))
-    return [
-        Result(
-            config=config,
-            identity=dataclasses.replace(identity, configs=(config,)),
-            metrics={name: rows[:, own] for name, rows in history.items()},
-            state=jax.tree.map(lambda leaf, own=own: leaf[own], state) if len(configs) > 1 else state,
-            env_steps=done * config.steps_per_iteration,
-            compile_seconds=program.compile_seconds,
-            wall_seconds=time.perf_counter() - start,
-            stopped=stopped[own],
+            snapshot = _restored(checkpoints, found, program, shared)
+        if settings.on_start:
+            settings.on_start(snapshot.history)
+        last = shared.num_iterations
+        snapshot = loop.go_on(
+            program,
+            shared,
+            snapshot,
+            last if settings.stop_after is None else min(settings.stop_after, last),
+            checkpoints=checkpoints,
+            observers=observers,
+            should_stop=settings.should_stop,
         )
-        for config, own in zip(configs, columns(len(configs), num_seeds), strict=True)
-    ]
+    return _results(configs, identity, snapshot, program.compile_seconds, time.perf_counter() - start)
 
 
-def _check_integer(name: str, value: Any, least: int, most: int = 2**31 - 1) -> None:
-    if not (is_integer(value) and least <= int(value) <= most):
-        raise ConfigError(f"{name} {value!r}: give an integer from {least} to {most}")
+@contextlib.contextmanager
+def _opened_checkpoints(settings: Settings, identity: Identity) -> Iterator[Checkpointer | None]:
+    """The checkpoints in `checkpoint_dir`, locked against other processes; None where there is no such folder."""
+    if settings.checkpoint_dir is None:
+        yield None
+        return
+    folder = Path(settings.checkpoint_dir)
+    with (
+        filesystem.hold(folder / ".writer.lock"),
+        Checkpointer(folder, identity, free=frozenset(settings.moved)) as checkpoints,
+    ):
+        yield checkpoints
 
 
-def columns(num_configs: int, num_seeds: int) -> list[slice]:
-    """Where each configuration's runs are among those of `train_runs`."""
-    return [slice(i * num_seeds, (i + 1) * num_seeds) for i in range(num_configs)]
+def _step_to_resume(checkpoints: Checkpointer, config: Config, settings: Settings) -> int | None:
+    """The newest intact step, or None to begin anew. It is checked here, because compiling takes long."""
+    if not settings.resume:
+        checkpoints.check_empty()
+        return None
+    step = checkpoints.latest_step()
+    if step is None:
+        return None
+    checkpoints.check_identity(step)
+    if step > config.num_iterations:
+        raise ConfigError(
+            f"env_steps {config.env_steps}: the training in {settings.checkpoint_dir} has done "
+            f"{step * config.steps_per_iteration}; give at least as many"
+        )
+    return step
 
 
-def join(configs: Sequence[Config], num_seeds: int) -> tuple[Config, dict[str, jax.Array]]:
-    """What the configurations share, and the traced fields in which they differ as arrays [num_runs].
-
-    Raises:
-        ConfigError: a static field differs: these cannot share a program.
-    """
+def _display(configs: Sequence[Config], env: Environment) -> Display:
+    """Shows the means over all runs, and the cost limit where all configurations have the same."""
     first = configs[0]
-    for name in field_names(traced=False):
-        values = sorted({str(getattr(config, name)) for config in configs})
-        if len(values) > 1:
-            raise ConfigError(f"{name} {' and '.join(values)}: only traced fields may differ within one program")
-    varied = {}
-    for name in field_names(traced=True):
-        of_config = [getattr(config, name) for config in configs]
-        if any(value != of_config[0] for value in of_config):
-            varied[name] = jnp.repeat(jnp.asarray(of_config, jnp.result_type(float)), num_seeds)
-    return first, varied
+    same_limit = all(config.cost_limit == first.cost_limit for config in configs)
+    return Display(
+        f"{first.method} {env.name}",
+        first.num_iterations,
+        first.cost_limit if same_limit else None,
+        has_multiplier=first.has_multiplier,
+    )
 
 
-@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
-def save(result: Result, directory: Path) -> None:
-    """Writes a finished run as a checkpoint of its own; the one of its program holds all the program's runs.
+def _first(program: Program, config: Config, settings: Settings, num_configs: int) -> Snapshot:
+    """The runs before their first iteration. Every configuration has the same keys, one for each seed."""
+    keys = jnp.tile(jax.random.split(jax.random.key(settings.seed), settings.num_seeds), num_configs)
+    return loop.snapshot_of(config, 0, program.init(keys), {})
 
-    What another training has left in `directory` is set aside.
-    """
-    if not result.metrics:
-        raise ConfigError(f"{directory}: nothing to save, as no iteration was carried out")
-    with Checkpointer(directory, result.identity) as checkpoints:
-        checkpoints.replace(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
+
+def _restored(checkpoints: Checkpointer, step: int, program: Program, config: Config) -> Snapshot:
+    """The runs as they were saved."""
+    state, history = _restore(checkpoints, step, program)
+    if not config.has_multiplier:
+        history.pop("multiplier", None)  # an earlier version logged 0 for methods that have none
+    return loop.snapshot_of(config, step, state, history)
 
 
 def _restore(checkpoints: Checkpointer, step: int, program: Program) -> tuple[GuardedState, History]:
@@ -301,7 +271,43 @@ def _restore(checkpoints: Checkpointer, step: int, program: Program) -> tuple[Gu
     return saved["state"], saved["history"]
 
 
-@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
+def _results(
+    configs: Sequence[Config], identity: Identity, snapshot: Snapshot, compile_seconds: float, wall_seconds: float
+) -> list[Result]:
+    """The last snapshot, cut into the results of the configurations."""
+    num_seeds = len(snapshot.stopped) // len(configs)
+    return [
+        Result(
+            config=config,
+            identity=dataclasses.replace(identity, configs=(config,)),
+            metrics={name: rows[:, own] for name, rows in snapshot.history.items()},
+            state=jax.tree.map(lambda leaf, own=own: leaf[own], snapshot.state) if len(configs) > 1 else snapshot.state,
+            env_steps=snapshot.iteration * config.steps_per_iteration,
+            compile_seconds=compile_seconds,
+            wall_seconds=wall_seconds,
+            stopped=snapshot.stopped[own],
+        )
+        for config, own in zip(configs, columns(len(configs), num_seeds), strict=True)
+    ]
+
+
+@jax.transfer_guard("allow")
+def save(result: Result, directory: Path) -> None:
+    """Writes a run of `train_runs` as a checkpoint of its own; the program's checkpoint holds all runs together.
+
+    What another training has left in `directory` is set aside.
+
+    Raises:
+        ConfigError: the run has taken no step.
+        CheckpointError: the checkpoint cannot be written.
+    """
+    if not result.metrics:
+        raise ConfigError(f"{directory}: nothing to save, as no iteration was carried out")
+    with Checkpointer(directory, result.identity) as checkpoints:
+        checkpoints.replace(len(result.metrics["env_steps"]), {"state": result.state, "history": result.metrics})
+
+
+@jax.transfer_guard("allow")
 def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int) -> Loaded:
     """The policies of the newest checkpoint in `checkpoint_dir`. Demonstrations are not needed.
 
@@ -309,34 +315,33 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
         CheckpointError: there is no intact checkpoint, or it is another training's.
     """
     config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
-    obs, action = jnp.zeros((1, env.obs_dim)), jnp.zeros((1, env.action_dim))
-    transitions = ExpertTransitions(obs=obs, action=action, next_obs=obs, terminated=jnp.zeros(1), initial_obs=obs)
-    steps = ExpertData(  # only their widths matter
-        obs=obs, action=action, held_out_obs=obs, held_out_action=action, transitions=transitions
-    )
-
-    def init(key: jax.Array) -> GuardedState:
-        return jax.vmap(make_agent(config, env, steps).init)(jax.random.split(key, num_seeds))
-
-    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
-    like = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device),
-        jax.eval_shape(init, jax.random.key(0)),
-    )
-    # Numbers inside the program do not matter for acting, and the limit may not be known without the demonstrations.
+    # Traced fields do not matter for acting, and the cost limit may not be known without the demonstrations.
     identity = Identity(configs=(config,), num_seeds=num_seeds)
     with Checkpointer(checkpoint_dir, identity, free=frozenset(field_names(traced=True)), readonly=True) as checkpoints:
         step = checkpoints.latest_step()
         if step is None:
             raise CheckpointError(f"{checkpoint_dir}: holds no finished checkpoint; train first, or continue the run")
-        saved = checkpoints.restore(step, {"state": like, "history": checkpoints.structure(step)["history"]})
-    return Loaded(config=config, agent=saved["state"].actor)
+        like = {
+            "state": _structure_of_state(config, env, num_seeds),
+            "history": checkpoints.structure(step)["history"],
+        }
+        saved = checkpoints.restore(step, like)
+    return Loaded(config=config, actor=saved["state"].actor)
 
 
-def _rows(metrics: History, done: int, config: Config) -> History:
-    """Metrics of a chunk [R, chunk] as rows [chunk, R], with the step counter."""
-    rows = {name: value.T for name, value in metrics.items()}
-    length, num_runs = next(iter(rows.values())).shape
-    # Counted on the host: a 32-bit counter would overflow.
-    env_steps = np.arange(done + 1, done + length + 1, dtype=np.int64) * config.steps_per_iteration
-    return {"env_steps": np.tile(env_steps[:, None], (1, num_runs)), **rows}
+def _structure_of_state(config: Config, env: Environment, num_seeds: int) -> GuardedState:
+    """Shapes and dtypes of a run's state, on one device. Nothing is computed."""
+    obs, action = jnp.zeros((1, env.obs_dim)), jnp.zeros((1, env.action_dim))
+    transitions = ExpertTransitions(obs=obs, action=action, next_obs=obs, terminated=jnp.zeros(1), initial_obs=obs)
+    expert = ExpertData(  # in place of demonstrations: a state depends only on their number of columns
+        obs=obs, action=action, held_out_obs=obs, held_out_action=action, transitions=transitions
+    )
+
+    def init(key: jax.Array) -> GuardedState:
+        return jax.vmap(guarded_agent(config, env, expert).init)(jax.random.split(key, num_seeds))
+
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device),
+        jax.eval_shape(init, jax.random.key(0)),
+    )

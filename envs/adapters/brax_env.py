@@ -11,7 +11,7 @@ import numpy as np
 from envs.base import State, check_shape, executed, first_state, next_state
 from envs.costs import checked_cost
 from envs.options import check_count
-from envs.registry import physics_name
+from envs.task_info import physics_name
 
 BraxState = Any
 # Parts of the names of wrappers' classes after which a step no longer says how the episode goes on.
@@ -21,9 +21,10 @@ HIDING_WRAPPERS = ("AutoReset", "Episode", "Vmap", "Eval")
 def to_brax(env: Any) -> Any:
     """One of ours as a `brax.envs.Env`.
 
-    By Brax's conventions actions are in [-1, 1] (mapped to our action range), `done` is termination alone, and the
-    time limit is the caller's `EpisodeWrapper`'s: give it `env.max_episode_steps`. `info["cost"]` has the step's
-    cost, `metrics` cost and reward terms, `pipeline_state` our whole `State`.
+    It follows Brax's conventions: actions are in [-1, 1] and are mapped to our range of actions; `done` means
+    termination alone; and the time limit is kept by the wrapper `EpisodeWrapper`, to which the caller gives
+    `env.max_episode_steps`. `info["cost"]` is the cost of the step, `metrics` has the cost and the terms of the reward,
+    and `pipeline_state` is our whole `State`.
     """
     import brax.envs
 
@@ -64,16 +65,17 @@ class FromBrax:
     program: see `envs.costs.checked_cost`.
 
     Args:
-        env: unwrapped, with actions in [-1, 1]. Its `done` is taken for termination.
-        cost: of (state before, action, state after), all in the original's form; a scalar >= 0.
-        name: for logs.
+        env: the environment without wrappers, with actions in [-1, 1]. Its `done` is taken for termination.
+        cost: a function of the state before, the action and the state after, both states in the original's form;
+            returns a scalar >= 0.
+        name: of the task, for messages and logs.
         max_episode_steps: control steps until truncation.
-        obs_key: which of its observations is shown, where `env` has several by name (as Playground's "state" and
-            "privileged_state"); None where it has one.
+        obs_key: where `env` has several observations by name (as Playground's "state" and "privileged_state"): the
+            name of the one that is shown. None where it has one observation.
 
     Raises:
-        ValueError: `env` is wrapped so that a step hides the episode's end; its observation or action is not one row
-            of numbers; or `obs_key` does not fit.
+        ValueError: a wrapper of `env` hides where an episode ends; an observation or an action is not one row of
+            numbers; or `obs_key` does not fit to `env`.
     """
 
     def __init__(
@@ -139,14 +141,14 @@ class FromBrax:
 
 
 def _wrappers(env: Any) -> Iterator[str]:
-    """Names of the classes around the innermost environment, from outside."""
+    """Names of the wrappers' classes, the outermost first."""
     while (inner := getattr(env, "__dict__", {}).get("env")) is not None:
         yield type(env).__name__
         env = inner
 
 
 def _length(what: str, size: Any) -> int:
-    """Of a row of numbers, whose size is said as a number or as a shape."""
+    """The length of a row of numbers. Brax says sizes as a number or as a shape."""
     try:
         (length,) = size if isinstance(size, tuple | list) else (size,)
         return operator.index(length)

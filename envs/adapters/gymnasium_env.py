@@ -77,15 +77,16 @@ class GymnasiumEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 
 class GymnasiumVectorEnv(VectorEnv):
-    """`num_envs` copies of one of our environments, reset in the step that ends an episode (`SAME_STEP`).
+    """`num_envs` copies of one of our environments as a `gymnasium.vector.VectorEnv`.
 
-    `info["cost"]` `[num_envs]` is the cost of the step just taken, also where the episode ended. There,
-    `info["final_obs"]` has the true successor and `info["final_info"]` cost, episode return and episode cost; as in
-    gymnasium, `info["_final_obs"]` marks those entries.
+    A copy is reset in the same step in which its episode ends (gymnasium's mode `SAME_STEP`). `info["cost"]`
+    `[num_envs]` is the cost of the step just taken, also where the episode ended. Where it ended, `info["final_obs"]`
+    has the last observation of that episode, and `info["final_info"]` has cost, episode return and episode cost. As in
+    gymnasium, `info["_final_obs"]` marks the copies to which this applies.
 
     Args:
-        env: one of ours with `action_low` and `action_high`.
-        num_envs: copies, stepped as one batch.
+        env: one of ours.
+        num_envs: number of copies, which are stepped as one batch.
     """
 
     def __init__(self, env: Any, num_envs: int):
@@ -137,7 +138,7 @@ class GymnasiumVectorEnv(VectorEnv):
     def _advance(
         self, key: jax.Array, state: State, actions: jax.Array
     ) -> tuple[jax.Array, State, tuple[jax.Array, ...]]:
-        """The next key, the states to go on from, and what `step` tells of those and of the true successors."""
+        """The next key, the states to go on from, and the arrays that `step` returns (see there)."""
         last = jax.vmap(self.env.step)(state, actions)
         key, reset_key = jax.random.split(key)
 

@@ -14,6 +14,7 @@ from ccil_jax.presets import PRESETS
 from ccil_jax.uses import Use
 from envs import registry
 from envs.registry import PHYSICS, TASKS, TaskInfo
+from envs.task_info import physics_name
 from experiments.cli.command_line import Parser, UsageError, boolean, integer, natural, positive
 
 CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
@@ -146,7 +147,7 @@ def has_option(task: TaskInfo, name: str) -> bool:
 def engine_of(task: str, env: Any) -> str:
     """The engine that an environment of the task runs on, as --physics names it; "auto" where there is no choice."""
     has_choice = has_option(registry.find_task(task), "physics")
-    return registry.physics_name(env) if has_choice else str(DEFAULTS["physics"])
+    return physics_name(env) if has_choice else str(DEFAULTS["physics"])
 
 
 def _parser_of(annotation: Any) -> Callable[[str], Any]:

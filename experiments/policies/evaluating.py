@@ -44,7 +44,7 @@ def load(run: Run) -> Loaded:
 
     env = envs.make(task.name, physics=run.facts["physics"], **run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
-    return Loaded(run=run, task=task, env=env, config=loaded.config, actor=loaded.agent)
+    return Loaded(run=run, task=task, env=env, config=loaded.config, actor=loaded.actor)
 
 
 def play(loaded: Loaded, settings: Settings) -> Any:

@@ -18,7 +18,8 @@ from experiments.runs.plans import ProgramPlan, RunPlan, Setup
 
 if TYPE_CHECKING:
     from ccil_jax.acting.evaluation import Evaluation
-    from ccil_jax.training.runner import History, Progress, Result
+    from ccil_jax.training.loop import History, Progress
+    from ccil_jax.training.runner import Result
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,7 +102,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
 def _announcement(program: ProgramPlan) -> str:
     setup, config = program.setup, program.config
     several = f"{len(program.runs)} configurations of " if len(program.runs) > 1 else ""
-    length = f"{config.bc_epochs} passes" if config.method == "bc" else f"{config.env_steps:,} steps"
+    length = f"{config.bc_epochs} passes" if not config.reads("env_steps") else f"{config.env_steps:,} steps"
     return (
         f"{config.method} on {setup.task}: {several}{setup.num_seeds} seed(s), {length} each, into "
         f"{program.checkpoint_dir.parent}"
@@ -165,10 +166,10 @@ def _train(
     Returns:
         The results of all runs, and the environment steps per second of all runs together.
     """
-    from ccil_jax.training import runner
+    from ccil_jax.training import combining, runner
 
     setup, config = program.setup, program.config
-    columns = runner.columns(len(program.runs), setup.num_seeds)
+    columns = combining.columns(len(program.runs), setup.num_seeds)
     with contextlib.ExitStack() as stack:
         recorder = _Recorder(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
 
@@ -207,14 +208,14 @@ def _evaluate(setup: Setup, results: Sequence["Result"], env: Any) -> tuple[list
     import jax
 
     from ccil_jax.acting import evaluation
-    from ccil_jax.training import runner
+    from ccil_jax.training import combining
 
     settings: Any = {"num_episodes": setup.eval_episodes, "seed": setup.evaluation_seed}
     # Each seed of a run plays episodes of its own. They are the same whatever is evaluated beside the run.
     draws = list(range(setup.num_seeds)) * len(results)
-    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.agent for result in results])
+    agents = jax.tree.map(lambda *leaves: jax.numpy.concatenate(leaves), *[result.actor for result in results])
     together = evaluation.evaluate(results[0].config, agents, env, draws=draws, **settings)
-    own = runner.columns(len(results), setup.num_seeds)
+    own = combining.columns(len(results), setup.num_seeds)
     evaluations = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], together) for rows in own]
     return evaluations, evaluation.random_policy(env, **settings)
 

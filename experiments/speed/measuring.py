@@ -25,7 +25,7 @@ from ccil_jax.presets import PRESETS
 from ccil_jax.training import program
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
-from envs.registry import physics_name
+from envs.task_info import physics_name
 from experiments.speed.turns import turn
 
 _MOST_SIMS = 1024  # of C MuJoCo, stepped for comparison

@@ -16,7 +16,7 @@ from ccil_jax.agents.on_policy import AgentState, Parts
 from ccil_jax.learning import policy_step
 from ccil_jax.learning.policy_step import PolicyStep
 from ccil_jax.types import Batch, Transition
-from envs.registry import physics_name
+from envs.task_info import physics_name
 from experiments.speed.measuring import (
     Setting,
     Work,
