@@ -40,7 +40,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"methods": ["malm"]}, "'methods': unknown; give env, method,"),
     "unknown field": ({"grid": {"gama": [0.9]}}, "--gama: unknown; did you mean --gamma?"),
     "fixed unknown field": ({"fixed": {"out": "x"}}, "--out: unknown"),
-    "unknown method": ({"method": "mallm"}, "--method 'mallm': unknown; choose one of malm"),
+    "unknown method": ({"method": "mallm"}, "--method 'mallm': unknown; did you mean malm? choose one of malm"),
     "unknown task": ({"grid": {**GRID, "env": ["Swimer"]}, "env": None}, "grid.env: also given outside of the grid"),
     "misspelt task": ({"env": "Swimer"}, "--env Swimer: unknown task; did you mean Swimmer?"),
     "empty grid": ({"grid": {}}, "grid: empty"),
