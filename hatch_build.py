@@ -34,7 +34,10 @@ class CommitHook(BuildHookInterface):  # type: ignore[type-arg]
 
 
 def commit_of(root: Path) -> str | None:
-    """The commit of the checkout `root`, with `-dirty` after it where files differ; None if it is none."""
+    """The commit of the checkout `root`, with `-dirty` after it where files differ; None if it is no checkout.
+
+    `experiments.runs.provenance._checkout_commit` is its twin: the build cannot import the package that it builds.
+    """
 
     def git(*arguments: str) -> str:
         done = subprocess.run(["git", *arguments], cwd=root, capture_output=True, text=True, timeout=10, check=True)

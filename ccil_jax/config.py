@@ -8,9 +8,10 @@ import dataclasses
 import math
 import numbers
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Unpack
 
 from ccil_jax.errors import ConfigError
+from ccil_jax.fields import Fields
 from ccil_jax.methods import Method, find_method
 from ccil_jax.presets import PRESETS
 from ccil_jax.uses import (
@@ -64,103 +65,174 @@ class Config:
     Sources beyond Table 1 are in the field's help text; "authors" means the paper's public code.
     """
 
-    method: str = _static("malm", "row of the methods table", ALL)
+    method: str = _static("malm", "name of the method, a row of the table in ccil_jax/methods.py", ALL)
     env_steps: int = _static(3_000_000, "environment steps per seed, rounded up to whole iterations", ACTING)
     num_envs: int = _static(16, "simulations stepped side by side, per seed", ACTING)
-    batch_size: int = _static(2000, "environment steps per generator step, K (Table 1)", ACTING)
+    batch_size: int = _static(
+        2000,
+        "environment steps of one batch, K in the paper; each policy update has a batch of its own (Table 1)",
+        ACTING,
+    )
     generator_steps: int = _static(3, "policy updates per iteration, each on a fresh batch (Table 1)", ACTING)
     discriminator_steps: int = _static(
-        1, "discriminator updates per iteration (Table 1), each a pass over the last batch in minibatches", ADVERSARIAL
+        1,
+        "passes of the discriminator over the last batch of an iteration, in minibatches (Table 1: 1 update)",
+        ADVERSARIAL,
     )
     discriminator_minibatch_size: int = _static(
         128,
-        "samples of either class per discriminator gradient step; the authors take the whole batch at once",
+        "learner's samples, and as many of the expert's, in one gradient step of the discriminator; the authors "
+        "take the "
+        "whole batch at once",
         ADVERSARIAL,
     )
-    held_out_fraction: float = _static(0.3, "share of the batch kept for the outer loss (authors)", MALM)
+    held_out_fraction: float = _static(
+        0.3, "share of the batch that the policy step does not see: the outer loss is computed on it (authors)", MALM
+    )
     hidden_sizes: tuple[int, ...] = _static(
         (100, 100), "hidden layers of policy, critics and discriminator (Table 1)", ALL
     )
     activation: str = _static("tanh", "activation of every network (Table 1)", ALL)
-    meta_gradient: str = _static("full", "outer step: total derivative, one of its two parts, or none", MALM)
+    meta_gradient: str = _static(
+        "full",
+        "derivative of the outer loss by the multiplier: full is direct + indirect. direct holds the updated "
+        "policy fixed, "
+        "indirect is the part through the policy step, none leaves the outer step out",
+        MALM,
+    )
     outer_advantage: str = _static(
         "stale",
-        "outer loss: advantages as the policy step saw them (authors), or by the updated networks",
+        "advantages in the outer loss: stale are those that the policy step used (authors), re-evaluated are "
+        "computed by "
+        "the updated critics and discriminator",
         META,
     )
     held_out_unit: str = _static(
         "transition",
-        "what is drawn for the outer loss: steps (authors), or whole simulations' stretches of the batch",
+        "what is drawn at random for the outer loss: single steps (authors), or all steps of a simulation in the batch",
         HELD_OUT,
     )
     multiplier_update: str = _static(
         "adam",
-        "dual step: adam on softplus(xi) (authors), projected sgd (Algorithm 1), a pid controller, or the optimal "
-        "value for each single step",
+        "how the multiplier lambda follows the cost gap: adam on xi with lambda = softplus(xi) (authors), sgd on "
+        "lambda "
+        "projected to [0, multiplier_max] (Algorithm 1), a pid controller, or the value that is optimal for each "
+        "policy "
+        "step (constrained policy optimisation)",
         LAGRANGIAN,
     )
     meta_update: str = _static(
-        "adam", "outer step: adam on the multiplier's parameter (authors) or sgd on lambda (line 16)", META
+        "adam",
+        "how the outer step moves the multiplier: adam on its parameter (authors), or sgd on lambda (Algorithm 1 "
+        "line 16)",
+        META,
     )
-    gate: str = _static("batch", "one decision per batch (Algorithm 2) or per episode (authors)", CVAG)
+    gate: str = _static(
+        "batch",
+        "whether reward or cost is followed is decided once a batch (Algorithm 2) or for each episode (authors)",
+        CVAG,
+    )
     reward_form: str = _static(
-        "softplus", "imitation reward from the logit h: softplus(h) = -log D, h, or log sigmoid(h)", ADVERSARIAL
+        "softplus",
+        "reward of the learner, from the discriminator's logit h: softplus(h) = -log D, logit h, or log sigmoid(h)",
+        ADVERSARIAL,
     )
-    discriminator_regularizer: str = _static("gradient_penalty", "what keeps the discriminator smooth", ADVERSARIAL)
-    cg_iterations: int = _static(10, "conjugate-gradient iterations (authors)")
-    fisher_stride: int = _static(5, "the Fisher product uses every n-th sample (authors)")
+    discriminator_regularizer: str = _static(
+        "gradient_penalty",
+        "what keeps the discriminator smooth: a penalty on its gradient (Gulrajani et al. 2017), or spectral "
+        "normalisation "
+        "of its weights (Miyato et al. 2018)",
+        ADVERSARIAL,
+    )
+    cg_iterations: int = _static(
+        10, "iterations of the conjugate-gradient method that solves for the natural directions (authors)"
+    )
+    fisher_stride: int = _static(
+        5, "every n-th sample of the batch enters the products with the Fisher matrix (authors)"
+    )
     line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
-    critic_epochs: int = _static(5, "passes over the batch per critic regression (authors)")
+    critic_epochs: int = _static(5, "passes of both critics over each batch (authors)")
     critic_minibatch_size: int = _static(
-        128, "samples per critic gradient step (authors); per step of bc; of either source per step of iq_learn", ALL
+        128,
+        "samples in one gradient step of a critic (authors), of bc's policy, or of iq_learn, which takes as many again "
+        "from the demonstrations",
+        ALL,
     )
-    standardize_cost_advantage: bool = _static(False, "also divide the cost advantage by its deviation", CONSTRAINED)
-    bootstrap_at_truncation: bool = _static(True, "use the critic's value at a time limit; false zeroes it (authors)")
-    bc_epochs: int = _static(200, "passes over the demonstrations; each is an iteration", BC)
+    standardize_cost_advantage: bool = _static(
+        False,
+        "whether the cost advantage is shifted to mean 0 and divided by its standard deviation, as the reward's "
+        "always is",
+        CONSTRAINED,
+    )
+    bootstrap_at_truncation: bool = _static(
+        True, "whether the future beyond a time limit counts, with the critic's value; false takes 0 for it (authors)"
+    )
+    bc_epochs: int = _static(200, "passes over the demonstrations; each is one iteration", BC)
     replay_size: int = _static(
-        200_000, "latest steps that are learnt from (published: 1e6, never filled here)", IQ_LEARN
+        200_000,
+        "environment steps that the replay memory holds, the newest ones (published: 1e6, never filled here)",
+        IQ_LEARN,
     )
     updates_per_step: int = _static(1, "gradient updates per environment step (published)", IQ_LEARN)
     value_loss: str = _static(
         "value",
-        "second term of the loss: V - y over expert and learner, or v0, (1 - gamma) V at first states",
+        "second term of the loss: value is the mean of V - y over expert's and learner's steps, v0 is (1 - gamma) V at "
+        "the demonstrations' first states",
         IQ_LEARN,
     )
     max_skipped_updates: int = _static(
-        10, "a seed stops after so many iterations in a row that were not finite; each is taken back", ALL
+        10, "an iteration that yields NaN or infinity is taken back; a seed stops after this many of them in a row", ALL
     )
 
-    gamma: float = _traced(0.995, "discount of reward and cost (Table 1)", ACTING)
-    gae_lambda: float = _traced(0.97, "decay of generalised advantage estimation, of the reward (Table 1)")
-    cost_gae_lambda: float = _traced(0.97, "the same, of the cost (Table 1)", CONSTRAINED)
-    max_kl: float = _traced(0.01, "trust-region radius, nats (Table 1)")
-    kl_tolerance: float = _traced(1.5, "a step is accepted up to this multiple of max_kl (authors)")
-    cg_damping: float = _traced(0.1, "added to the Fisher matrix's diagonal (authors)")
-    critic_learning_rate: float = _traced(1e-3, "Adam, both critics (Table 1)", ACTING)
-    discriminator_learning_rate: float = _traced(3e-4, "Adam (Table 1)", ADVERSARIAL)
-    policy_entropy_coefficient: float = _traced(0.0, "beta, weight of the policy's entropy (Table 1)")
-    discriminator_entropy_coefficient: float = _traced(
-        1e-3, "weight of the discriminator's entropy bonus (Table 1)", ADVERSARIAL
+    gamma: float = _traced(0.995, "discount factor of reward and cost, per step (Table 1)", ACTING)
+    gae_lambda: float = _traced(0.97, "lambda of generalised advantage estimation, for the reward (Table 1)")
+    cost_gae_lambda: float = _traced(
+        0.97, "lambda of generalised advantage estimation, for the cost (Table 1)", CONSTRAINED
     )
-    gradient_penalty_coefficient: float = _traced(1.0, "weight of the gradient penalty", PENALIZED)
+    max_kl: float = _traced(0.01, "radius of the trust region: KL divergence from the old policy, nats (Table 1)")
+    kl_tolerance: float = _traced(
+        1.5, "the line search accepts a step whose KL divergence is at most this multiple of max_kl (authors)"
+    )
+    cg_damping: float = _traced(0.1, "number added to the diagonal of the Fisher matrix (authors)")
+    critic_learning_rate: float = _traced(1e-3, "learning rate of both critics, Adam (Table 1)", ACTING)
+    discriminator_learning_rate: float = _traced(
+        3e-4, "learning rate of the discriminator, Adam (Table 1)", ADVERSARIAL
+    )
+    policy_entropy_coefficient: float = _traced(
+        0.0, "weight of the policy's entropy in its objective, beta in the paper (Table 1)"
+    )
+    discriminator_entropy_coefficient: float = _traced(
+        1e-3, "weight of the entropy bonus in the discriminator's loss (Table 1)", ADVERSARIAL
+    )
+    gradient_penalty_coefficient: float = _traced(
+        1.0, "weight of the gradient penalty in the discriminator's loss", PENALIZED
+    )
     initial_multiplier: float = _traced(0.01, "lambda before the first iteration (Table 1)", MULTIPLIER)
-    multiplier_learning_rate: float = _traced(0.05, "dual step size (Table 1)", ASCENT)
-    meta_learning_rate: float = _traced(0.05, "outer step size (Table 1)", META)
-    multiplier_max: float = _traced(100.0, "cap of the multiplier", MULTIPLIER)
-    pid_proportional_gain: float = _traced(0.5, "of the smoothed cost gap, relative to the limit", PID)
-    pid_integral_gain: float = _traced(0.05, "of the sum of relative gaps", PID)
-    pid_derivative_gain: float = _traced(0.5, "of the rise of the smoothed relative gap", PID)
-    pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap that stays", PID)
-    actor_learning_rate: float = _traced(1e-3, "Adam, policy of bc and iq_learn", OFF_POLICY)
-    target_update_rate: float = _traced(0.005, "Polyak average of the target critic (published)", IQ_LEARN)
-    chi2_coefficient: float = _traced(0.5, "alpha of the chi-square term, r^2 / (4 alpha) (published)", IQ_LEARN)
-    temperature: float | None = _traced(None, "weight of the entropy; none: the task's published value", IQ_LEARN)
+    multiplier_learning_rate: float = _traced(0.05, "step size of the dual step (Table 1)", ASCENT)
+    meta_learning_rate: float = _traced(0.05, "step size of the outer step (Table 1)", META)
+    multiplier_max: float = _traced(100.0, "largest value of the multiplier", MULTIPLIER)
+    pid_proportional_gain: float = _traced(0.5, "gain of the smoothed cost gap e = (J - limit) / limit", PID)
+    pid_integral_gain: float = _traced(0.05, "gain of the sum of all gaps so far", PID)
+    pid_derivative_gain: float = _traced(0.5, "gain of the rise of the smoothed gap, where it rises", PID)
+    pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap in the new one", PID)
+    actor_learning_rate: float = _traced(1e-3, "learning rate of the policy of bc and iq_learn, Adam", OFF_POLICY)
+    target_update_rate: float = _traced(
+        0.005, "share of the critic in each update of its Polyak average, the target critic (published)", IQ_LEARN
+    )
+    chi2_coefficient: float = _traced(
+        0.5, "alpha of the chi-square term r^2 / (4 alpha) of the loss (published)", IQ_LEARN
+    )
+    temperature: float | None = _traced(
+        None, "weight of the entropy in the soft values; none takes the task's published value", IQ_LEARN
+    )
     cost_limit: float | None = _traced(
-        None, "episode cost limit; all other constrained methods take the demonstrations' mean", LIMITED
+        None,
+        "limit of an episode's cost; all other constrained methods take the mean cost of their demonstrations",
+        LIMITED,
     )
 
     @classmethod
-    def from_preset(cls, preset: str, **changes: Any) -> "Config":
+    def from_preset(cls, preset: str, **changes: Unpack[Fields]) -> "Config":
         """The preset with `changes` on top. What it says of fields that the method does not use is left out.
 
         Raises:
@@ -264,7 +336,7 @@ def with_limit_of(config: Config, mean_episode_cost: float) -> Config:
     """
     if config.row.limit != "demonstrations":
         return config
-    if config.cost_limit not in (None, mean_episode_cost):
+    if _is_traced(config.cost_limit) or config.cost_limit not in (None, mean_episode_cost):
         raise ConfigError(_limit_by_hand(config))
     return config.replace(cost_limit=mean_episode_cost)
 
@@ -316,6 +388,14 @@ def check_types(config: Config) -> None:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
 
 
+_ANY = 0.5  # within the range of every traced field
+
+
+def _is_traced(value: Any) -> bool:
+    """Whether this is a number of JAX, inside a program perhaps, where nobody knows it yet."""
+    return not isinstance(value, numbers.Number) and getattr(value, "shape", None) == () and hasattr(value, "aval")
+
+
 def _is_number(value: Any) -> bool:
     if not isinstance(value, numbers.Real) or isinstance(value, bool):
         return False
@@ -335,8 +415,11 @@ def validate(config: Config) -> None:
     """Raises `ConfigError` for a combination that cannot run, before anything is compiled.
 
     A field that makes no difference must have its default: any other value was given by hand, in vain. A resolved
-    limit of the demonstrations' is let through; `with_limit_of` compares it with them.
+    limit of the demonstrations' is let through; `with_limit_of` compares it with them. Numbers of JAX, as traced fields
+    have them inside a program, are taken on trust.
     """
+    traced = (name for name in field_names(traced=True) if _is_traced(getattr(config, name)))
+    config = config.replace(**dict.fromkeys(traced, _ANY))
     check_types(config)
     resolved = {"cost_limit"} if config.row.limit == "demonstrations" else set()
     check_used(config, (n for n in _USES if getattr(config, n) != _DEFAULTS[n] and n not in resolved))

@@ -79,7 +79,7 @@ def find_method(name: Any) -> Method:
     if isinstance(name, str) and name in _methods:
         return _methods[name]
     if not isinstance(name, str) or ":" not in name:
-        near = hint(name, _methods) if isinstance(name, str) else ""
+        near = hint(name, list(_methods)) if isinstance(name, str) else ""
         raise ConfigError(f"--method {name!r}: unknown; {near}choose one of {', '.join(_methods)}")
     try:
         method = named_object(name)
@@ -111,5 +111,5 @@ def function_of(part: Part, table: Mapping[str, Maker], what: str) -> Maker | Ca
     if callable(part):
         return part
     if part not in table:
-        raise ConfigError(f"{what} {part!r}: unknown; {hint(part, table)}choose one of {', '.join(table)}")
+        raise ConfigError(f"{what} {part!r}: unknown; {hint(part, list(table))}choose one of {', '.join(table)}")
     return table[part]

@@ -7,12 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
-    # Table 1 says "1 discriminator update" for 3 policy steps. One full-batch step trails the policy (on Swimmer the
-    # two went round in circles), hence minibatches; without a penalty the discriminator then wins outright where the
-    # classes part easily (HalfCheetah).
+    # Table 1 says "1 discriminator update" for 3 policy steps. A single gradient step on the whole batch is too slow to
+    # follow the policy: on Swimmer both went round in circles. So the update is one pass in minibatches. With that many
+    # gradient steps the discriminator separates the classes completely where that is easy (HalfCheetah), and its reward
+    # no longer tells better from worse. So it has a gradient penalty.
     "paper": {},
-    # The best of what docs/ablations.md measures at this length: CVAG's gate by episode, and a multiplier that moves
-    # with the size of the gap (CCIL: 74 % of the return instead of 58 on HalfCheetah, 98 instead of 66 on Swimmer).
+    # The best of what docs/ablations.md measures at this length: CVAG decides for each episode, and the multiplier
+    # moves in proportion to the gap (CCIL: 74 % of the return instead of 58 on HalfCheetah, 98 instead of 66 on
+    # Swimmer).
     "default": {
         "env_steps": 1_500_000,
         "gate": "episode",
@@ -28,8 +30,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "discriminator_minibatch_size": 2000,
         "discriminator_regularizer": "none",
     },
-    # What the authors' code does: Adam on xi for both steps of the multiplier, CVAG's gate by episode, no value beyond
-    # a time limit. It counts the steps of one batch of the three, so its 1e7 are 3e7 here.
+    # What the authors' code does: Adam on xi for both steps of the multiplier, CVAG's decision for each episode, a
+    # value of 0 beyond a time limit. That code counts the steps of one batch in three, so its 1e7 steps are 3e7 here.
     "authors": {
         "meta_gradient": "direct",
         "gate": "episode",
@@ -37,11 +39,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "discriminator_minibatch_size": 2000,
         "discriminator_regularizer": "none",
     },
-    # No discriminator has to keep up with the policy: one larger batch and a wider trust region per iteration.
+    # No discriminator has to follow the policy, so an iteration has one larger batch and a wider trust region.
     "expert": {"env_steps": 2_000_000, "batch_size": 4000, "generator_steps": 1, "max_kl": 0.02, "gamma": 0.99},
-    # Costs are rare here (some 25 visits of a hazard in 20,000 steps), so their gradient is mostly noise. Hence large
-    # batches, small steps, and a multiplier that slows down as the cost nears its limit: Adam's walks past it. A short
-    # lambda for the cost leaves the critic's errors in charge: with 0.8 PointGoal1's cost did not fall at all.
+    # Costs are rare in these tasks (some 25 visits of a hazard in 20,000 steps), so their gradient is mostly noise.
+    # Hence large batches, small steps, and a multiplier that moves in proportion to the gap: Adam's steps have the same
+    # size near the limit and overshoot it. A small lambda of the cost's advantage estimation relies on the critic,
+    # whose errors are large here: with 0.8 the cost on PointGoal1 did not fall at all.
     "safety_gym_expert": {
         "env_steps": 8_000_000,
         "num_envs": 32,
@@ -55,7 +58,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "multiplier_learning_rate": 7e-4,
     },
     "bc": {"method": "bc"},
-    # As published, but for the length: 60,000 steps with as many updates sufficed on HalfCheetah.
+    # As published, except for the length: 60,000 steps with as many updates were enough on HalfCheetah.
     "iq_learn": {
         "method": "iq_learn",
         "env_steps": 100_000,

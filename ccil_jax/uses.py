@@ -6,12 +6,9 @@ the refusal of an option that would have no effect. `tests/test_config.py` compa
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 from ccil_jax.methods import METHODS, Method
-
-if TYPE_CHECKING:
-    from ccil_jax.config import Config
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +17,7 @@ class Use:
 
     reads: Callable[[Method], bool]  # whether the method of a row reads the field
     note: str = "{methods}"  # completes "used by ..."; {methods} stands for the names of those methods
-    where: Callable[["Config"], bool] = lambda config: True  # what other fields must hold besides
+    where: Callable[[Any], bool] = lambda config: True  # what other fields of the `Config` must hold besides
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -32,7 +29,7 @@ class Use:
         """Completes "used by ..."."""
         return self.note.format(methods=", ".join(self.methods))
 
-    def holds(self, config: "Config") -> bool:
+    def holds(self, config: Any) -> bool:
         """Whether the field matters to `config`."""
         return self.reads(config.row) and self.where(config)
 

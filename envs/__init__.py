@@ -9,14 +9,41 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Never
 
+from envs.gymnasium_tasks import register_once_imported, register_with_gymnasium
 from envs.registry import PHYSICS, TASKS, TaskInfo, find_task, register
 
 if TYPE_CHECKING:
+    from envs.adapters.brax_env import FromBrax, to_brax
+    from envs.adapters.gymnasium_env import GymnasiumEnv, GymnasiumVectorEnv
     from envs.base import Environment, State
+    from envs.costs import with_cost
 
-__all__ = ["PHYSICS", "TASKS", "Environment", "State", "TaskInfo", "find_task", "make", "register"]
+__all__ = [
+    "PHYSICS",
+    "TASKS",
+    "Environment",
+    "FromBrax",
+    "GymnasiumEnv",
+    "GymnasiumVectorEnv",
+    "State",
+    "TaskInfo",
+    "find_task",
+    "make",
+    "register",
+    "register_with_gymnasium",
+    "to_brax",
+    "with_cost",
+]
 
-_LAZY = {"Environment": "envs.base", "State": "envs.base"}
+_LAZY = {
+    "Environment": "envs.base",
+    "State": "envs.base",
+    "FromBrax": "envs.adapters.brax_env",
+    "to_brax": "envs.adapters.brax_env",
+    "GymnasiumEnv": "envs.adapters.gymnasium_env",
+    "GymnasiumVectorEnv": "envs.adapters.gymnasium_env",
+    "with_cost": "envs.costs",
+}
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -66,7 +93,16 @@ def make(
     return environment
 
 
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module 'envs' has no attribute {name!r}")
+if not TYPE_CHECKING:  # a type checker knows all names, and should report others
+
+    def __getattr__(name: str) -> Any:
+        if name in _LAZY:
+            return getattr(importlib.import_module(_LAZY[name]), name)
+        raise AttributeError(f"module 'envs' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+register_once_imported()

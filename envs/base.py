@@ -1,11 +1,12 @@
 """The contract between environments and learners.
 
 An environment is a set of pure functions of one simulation; callers `vmap` them.
-Auto-reset is not here: `ccil_jax.acting.rollout` owns it, so `step` always returns the true successor.
+`step` does not start the next episode when one ends: it always returns the true successor of the state that it was
+given. Starting anew is the task of the code that collects episodes (`ccil_jax.acting.rollout`).
 """
 
 from collections.abc import Iterable
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +14,6 @@ import numpy as np
 from flax import struct
 
 PyTree = Any
-Tree = TypeVar("Tree")
-Carry = TypeVar("Carry")
-Inputs = TypeVar("Inputs")
-Outputs = TypeVar("Outputs")
-Arguments = ParamSpec("Arguments")
 
 
 @struct.dataclass(kw_only=True)
@@ -72,8 +68,8 @@ def next_state(
 ) -> State:
     """The state a control step after `state`, with its totals.
 
-    Where `finite` [] bool is false the episode terminates, nothing is earned or paid, and what is not finite is shown
-    as 0: one NaN would spoil a learner's whole batch.
+    Where `finite` [] bool is false, the episode terminates, reward and cost of the step are 0, and every number that is
+    NaN or infinite is shown as 0. The reason: one NaN would spoil a learner's whole batch.
     """
     finite = jnp.asarray(finite)
 
@@ -134,9 +130,10 @@ class Environment(Protocol):
 
 
 def check_shape(what: str, array: jax.typing.ArrayLike, expected: tuple[int, ...]) -> None:
-    """Refuses an array of another shape, which NumPy's rules would silently repeat along the axes that it lacks.
+    """Refuses an array of another shape.
 
-    Shapes are known while JAX traces, so the check costs nothing in a compiled program.
+    Without the check, broadcasting would silently repeat the array along the axes that it lacks. Shapes are known
+    while JAX traces, so the check costs nothing in a compiled program.
 
     Args:
         what: the task and the argument, for the message.

@@ -1,11 +1,14 @@
 """Swimmer, HalfCheetah, Hopper, Walker2d, Ant, Humanoid as gymnasium's `-v5`, with the paper authors' 0/1 cost.
 
-Where they depart from `-v5`, on purpose:
-* observations hold no external contact forces (Ant 27, Humanoid 270 entries);
-* actions are clipped to the control range first, so that costs see what the engine sees;
-* the reward is the authors' ("reward used" below): forward and healthy terms, the control cost only where they
-  keep it (Swimmer, Walker2d), never the contact cost;
-* the cost is 1 where the task's quantity exceeds `cost_threshold`, else 0.
+They differ from `-v5`, on purpose, in this:
+* observations have no external contact forces (so Ant's have 27 entries, Humanoid's 270);
+* actions are clipped to the control range first, so that costs depend on the actions that the engine gets;
+* the reward is that of the authors: the forward and healthy terms, the control cost only where they keep it (Swimmer,
+  Walker2d), never the contact cost;
+* there is a cost, which is 1 where the task's quantity exceeds `cost_threshold`, else 0.
+
+A task of your own is a `LocomotionTask` of your own: `Locomotion(row, name="Mine", cost_threshold=1.0)`. A function
+that returns it can be registered by `envs.register`.
 """
 
 import importlib.util
@@ -198,8 +201,8 @@ def make(name: str, **options: Any) -> Locomotion:
 def load_model(xml: str) -> mujoco.MjModel:
     """Loads a model file from the installed gymnasium's assets.
 
-    The compiler's deprecation warnings about these files are dropped: MuJoCo would also write them to a log file in
-    the working directory.
+    MuJoCo's compiler warns that these files are in an old style, and writes that to a log file in the working directory
+    too. These warnings are dropped.
 
     Raises:
         ImportError: gymnasium is not installed.

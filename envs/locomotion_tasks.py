@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,10 @@ class CostInputs:
     velocity: jax.Array  # [2] m/s, of the root during the control step
     control_cost: jax.Array  # [] the task's weight times the sum of squared actions
     contact_cost: jax.Array  # [] 0 where the contact term is switched off
-    data: Data | None = None  # the physics after the control step
-    action: jax.Array | None = None  # [action_dim] as executed
+    # The `Data` after the control step and the action [action_dim] as executed. Both are None where an episode of
+    # gymnasium's simulator is scored, which reports the three numbers above alone.
+    data: Any = None
+    action: Any = None
 
 
 OfData = Callable[[mujoco.MjModel, Data], jax.Array]

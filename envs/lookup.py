@@ -22,6 +22,14 @@ def own_object(text: str) -> Any:
     return getattr(importlib.import_module(module), attribute)
 
 
+def parts(text: str) -> tuple[str, str]:
+    """Module and attribute of "module:attribute". Raises `ValueError` where the text has another form."""
+    form = _FORM.fullmatch(text)
+    if form is None:
+        raise ValueError(f"{text}: not of the form module:attribute; write for example my_package.tasks:make")
+    return form[1], form[2]
+
+
 def named_object(text: str) -> Any:
     """The object that a user's text names. Its module is imported.
 
@@ -38,12 +46,7 @@ def named_object(text: str) -> Any:
         ValueError: the text has another form, there is no such module, its import raises an error, or it has no such
             attribute. The message is one line that says what to do.
     """
-    form = _FORM.fullmatch(text)
-    if form is None:
-        raise ValueError(
-            f"{text}: not of the form module:attribute; write for example my_package.my_module:my_function"
-        )
-    module_name, attribute = form.groups()
+    module_name, attribute = parts(text)
     if not {"", os.getcwd()} & set(sys.path):
         sys.path.insert(0, os.getcwd())
     try:

@@ -38,7 +38,7 @@ def _check_switch(what: str, value: Any) -> None:
         raise ValueError(f"{what} {value!r}: must be True or False")
 
 
-# By the option's name. An option that is not here, which only a registered task can have, is checked by that task.
+# The check of each option by its name. Registered tasks may have other options, which they check themselves.
 CHECKS: Mapping[str, Callable[[str, Any], None]] = MappingProxyType(
     {
         "max_episode_steps": check_count,

@@ -11,68 +11,12 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal
 
-from envs.engines import AUTO, PHYSICS, check_physics
-from envs.lookup import hint, named_object, own_object
-from envs.options import CHECKS, COMMON
+from envs.engines import PHYSICS
+from envs.lookup import hint, named_object, own_object, parts
+from envs.options import COMMON
+from envs.task_info import MAX_EPISODE_STEPS, TaskInfo
 
-__all__ = ["PHYSICS", "TASKS", "TaskInfo", "check_options", "find_task", "physics_name", "register"]
-
-_MAX_EPISODE_STEPS = 1000
-_MEMBERS = ("name", "obs_dim", "action_dim", "action_low", "action_high", "max_episode_steps", "reset", "step")
-
-
-def _nothing() -> Mapping[str, Any]:
-    return MappingProxyType({})
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class TaskInfo:
-    """What is known of a task without building it."""
-
-    name: str
-    build: Callable[..., Any] | str  # called with options by keyword, returns an `Environment`; or "module:attribute"
-    family: str = "registered"  # which table the task is a row of, to list related tasks together
-    # This task's own options, with the values that they have by default.
-    options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
-    common: frozenset[str] = frozenset(COMMON)  # those of `envs.options.COMMON` that `build` takes
-    obs_dim: int | None = None  # None: known only once the task is built
-    action_dim: int | None = None  # None: known only once the task is built
-    max_episode_steps: int | None = _MAX_EPISODE_STEPS  # the default; None: known only once the task is built
-    cost_limit: float | None = None  # default episode cost allowed to the expert that records demonstrations
-    cost: str = ""  # what costs how much in a step, in words
-    expert_preset: str = "expert"  # the hyperparameters that an expert starts from, a key of `ccil_jax.config.PRESETS`
-    original: str | None = None  # the environment that the task is compared with
-    original_package: Literal["gymnasium", "safety_gymnasium"] | None = None  # which has that environment
-    # Options of that environment which make its observations those of the task.
-    original_options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
-    # How a report draws an episode: bodies seen from the "side" or from "above", or a map of the whole "arena".
-    view: Literal["side", "above", "arena"] | None = None
-
-    def make(self, physics: str, options: Mapping[str, Any]) -> Any:
-        """Builds the task. `options` has any of its options; what is absent has the default.
-
-        Raises:
-            ValueError: the task has no such option, it cannot have that value, or what was built is no `Environment`
-                of the promised sizes.
-        """
-        check_options(self, physics, options)
-        arguments = {**self.options, **options}
-        if "physics" in self.common:
-            arguments["physics"] = physics
-        if "max_episode_steps" in self.common and self.max_episode_steps is not None:
-            arguments.setdefault("max_episode_steps", self.max_episode_steps)
-        build = named_object(self.build) if isinstance(self.build, str) else self.build
-        env = build(**arguments)
-        if missing := [member for member in _MEMBERS if not hasattr(env, member)]:
-            raise ValueError(
-                f"{self.name}: what was built, a {type(env).__name__}, has no {', '.join(missing)}; "
-                "return an envs.Environment"
-            )
-        for member in ("obs_dim", "action_dim"):
-            wanted, found = getattr(self, member), getattr(env, member)
-            if wanted not in (None, found):
-                raise ValueError(f"{self.name}: {member} is {found}, but registered as {wanted}; correct either")
-        return env
+__all__ = ["PHYSICS", "TASKS", "TaskInfo", "find_task", "register"]
 
 
 def _build(target: str, name: str, **options: Any) -> Any:
@@ -180,7 +124,7 @@ def register(
     Raises:
         ValueError: the name is taken or has other characters, or a parameter of `build` lacks a default value.
     """
-    if not re.fullmatch(r"[\w.-]+", str(name)):
+    if not re.fullmatch(r"[\w.-]+", name):
         raise ValueError(f"{name!r}: the name of a task is of letters, digits, '_', '.' and '-'; choose such a name")
     if name in _tasks:
         raise ValueError(f"{name}: a task of this name is registered already; choose another name")
@@ -194,7 +138,9 @@ def register(
         expert_preset=expert_preset,
         original=original,
     )
-    if not isinstance(build, str):
+    if isinstance(build, str):
+        parts(build)  # is it of the right form?
+    else:
         task = _with_signature(task)
     _tasks[name] = task if options is None else dataclasses.replace(task, options=MappingProxyType(dict(options)))
     return _tasks[name]
@@ -207,22 +153,22 @@ def _with_signature(task: TaskInfo) -> TaskInfo:
             f"{task.name}: what builds a task must be a function or a class, not {type(task.build).__name__}; "
             "give one that returns an envs.Environment"
         )
-    options, common = {}, {}
+    options: dict[str, Any] = {}
+    common: dict[str, Any] = {}
     for parameter in inspect.signature(task.build).parameters.values():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        if parameter.name in COMMON:
-            common[parameter.name] = parameter.default
-        elif parameter.default is parameter.empty or parameter.kind is parameter.POSITIONAL_ONLY:
+        always_given = parameter.name in ("physics", "max_episode_steps")
+        lacks_default = parameter.default is parameter.empty and not always_given
+        if lacks_default or parameter.kind is parameter.POSITIONAL_ONLY:
             raise ValueError(
                 f"{task.name}: parameter {parameter.name!r} of what builds the task must have a default value and be "
                 "given by keyword; change its signature"
             )
-        else:
-            options[parameter.name] = parameter.default
+        (common if parameter.name in COMMON else options)[parameter.name] = parameter.default
     limit = common.get("max_episode_steps")
     if limit is inspect.Parameter.empty:
-        limit = _MAX_EPISODE_STEPS
+        limit = MAX_EPISODE_STEPS
     return dataclasses.replace(
         task, options=MappingProxyType(options), common=frozenset(common), max_episode_steps=limit
     )
@@ -247,26 +193,3 @@ def find_task(name: Any) -> TaskInfo:
         spelling.casefold(): task.name for task in _tasks.values() for spelling in (task.name, task.original or "")
     }
     raise ValueError(f"{name}: unknown task; {hint(str(name), spellings)}choose one of {', '.join(_tasks)}")
-
-
-def check_options(task: TaskInfo, physics: Any, options: Mapping[str, Any]) -> None:
-    """Checks what `envs.make` was given besides the task.
-
-    Raises:
-        ValueError: the task has no such option, or it cannot have that value.
-    """
-    check_physics(physics)
-    names = [name for name in (*COMMON, *task.options) if name in task.common or name in task.options]
-    listed = f"its options are {', '.join(names)}" if names else "it has no options"
-    if physics != AUTO and "physics" not in names:
-        raise ValueError(f"{task.name}: physics {physics!r} has no effect, the task has no such option; leave it out")
-    for name, value in options.items():
-        if name == "physics" or name not in names:
-            raise ValueError(f"{task.name} has no option {name!r}; {hint(name, names)}{listed}")
-        if name in CHECKS:
-            CHECKS[name](f"{task.name}: {name}", value)
-
-
-def physics_name(env: Any) -> str:
-    """The engine that an environment runs on, for records; the name of its class where it does not say."""
-    return str(getattr(env, "physics_name", type(env).__name__))

@@ -11,7 +11,11 @@ from envs.jax_tools import numbers
 
 
 def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:
-    """Checks what every environment owes its learner: shapes, types, finiteness, structure, purity, totals.
+    """Checks the promises of `Environment` and `State` on random episodes.
+
+    Shapes and types are as promised; observations, rewards and costs are finite; costs are not negative; the totals of
+    an episode are the sums of its steps; every key starts another episode; the same arguments give the same bits; and
+    actions are clipped.
 
     Args:
         env: an `Environment`.

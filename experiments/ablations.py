@@ -101,7 +101,6 @@ COLUMNS = {
     "windup": "wound up",
     "relative_speed": "steps/s : baseline",
 }
-_OWN = ("questions", "workers", "launcher", "slurm", "out", "resume")
 
 
 def make_parser() -> Parser:
@@ -179,7 +178,8 @@ def _relative_speed(row: Row, baseline: Row | None) -> float | None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Trains what is missing, then writes ablations.csv and ablations.png; status 1 if a program failed."""
-    shared = {name: value for name, value in vars(arguments).items() if name not in _OWN}
+    own = ("questions", *dispatch.option_names())
+    shared = {name: value for name, value in vars(arguments).items() if name not in own}
     task = options.find_task(shared.get("env"))
     answers = ask(arguments.questions, shared, arguments.out)
     different = list({variant.name: variant for variant in answers.values()}.values())

@@ -7,26 +7,19 @@ turn, and medians are reported, so that other work on the machine spoils a round
 import argparse
 import json
 import math
-import os
-import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import Config
 from ccil_jax.methods import METHODS
 from ccil_jax.presets import PRESETS
-from ccil_jax.training.versions import versions
-from envs.registry import PHYSICS
-from experiments.cli import command_line, interruption, options, xla
+from envs.registry import PHYSICS, TaskInfo
+from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
-from experiments.cli.tables import show
 from experiments.runs import run_folder
-from experiments.speed import peers
-from experiments.sweeps import backends
+from experiments.speed import peers, row_processes, tables
 
 _LEAST_STEPS = 16  # of each simulation in a batch
 
@@ -92,7 +85,7 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         options.config_from(chosen, arguments.preset, {"cost_limit": 0.0, **changes[num_envs]})
     return [
         {
-            "task": options.find_task(task, "--tasks").name,
+            "task": _find_task(task).name,
             "physics": physics,
             "method": arguments.method,
             "num_seeds": num_seeds,
@@ -110,6 +103,13 @@ def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
+def _find_task(name: str) -> TaskInfo:
+    task = options.find_task(name, "--tasks")
+    if not options.has_option(task, "physics"):
+        raise UsageError(f"--tasks {name}: takes no physics, so there is no engine to compare it with; see `growth`")
+    return task
+
+
 def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]:
     """Changes to the preset, so that `num_envs` simulations fill its batch or, where they are many, a larger one."""
     config = Config(**PRESETS[preset])
@@ -121,173 +121,66 @@ def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]
     return {"batch_size": batch_size} | {name: times * getattr(config, name) for name in minibatches}
 
 
-def measure_row(setting: dict[str, Any], launcher: str = "benchmark", *options: str) -> dict[str, Any]:
-    """Measures one setting in a process of its own. Raises `UsageError` with its last words if that process fails."""
-    command = [sys.executable, "-P", "-m", f"experiments.{launcher}", *options, "--row", json.dumps(setting)]
-    # The compilation is measured, so nothing may come from a cache.
-    environment = {**os.environ, "PYTHONPATH": backends.python_path(), "JAX_ENABLE_COMPILATION_CACHE": "false"}
-    if setting.get("turns"):  # an accelerator's memory is shared
-        environment.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    ears, mouth = os.pipe()  # they close with this process, and then the row ends too
-    with open(ears, "rb") as stdin, open(mouth, "wb"):
-        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, check=False, env=environment)
-    if done.returncode != 0:
-        last = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
-        raise UsageError(f"{_name(setting)}: cannot be measured: {last[0]}")
-    row: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return row
-
-
-def begin_row(text: str) -> dict[str, Any]:
-    """In a row's own process: the setting that `measure_row` gave it, once this process is as training's would be."""
-    interruption.stop_at_eof()
-    setting: dict[str, Any] = json.loads(text)
-    xla.spread_seeds(setting["num_seeds"])
-    return setting
-
-
-def _name(setting: Mapping[str, Any]) -> str:
-    size = f"{setting['num_seeds']} x {setting['num_envs']}"
-    return f"{setting['task']} ({setting['physics']}), {size}"
-
-
-def facts_of_machine() -> dict[str, Any]:
-    """What goes with every measurement."""
-    return {
-        "command": command_line.command(),
-        "versions": versions(),
-        "git_commit": run_folder.git_commit(),
-        "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load_average": os.getloadavg(),
-    }
-
-
-def print_rows(rows: Sequence[dict[str, Any]]) -> None:
-    """The rows as a terminal table."""
-    from rich.table import Table
-
-    table = Table(title="control steps per second, all seeds together", title_justify="left")
-    for title in ("task", "seeds x envs", "physics alone", "rollout", "training"):
-        table.add_column(title, justify="left" if title == "task" else "right", no_wrap=True)
-    for title in ("training / physics", "training / rollout", "meta-gradient / policy step", "compile, s", "peak, MiB"):
-        table.add_column(title, justify="right")
-    for row in rows:
-        rates = [row[f"{name}_steps_per_second"] for name in ("physics", "rollout", "training")]
-        table.add_row(
-            f"{row['task']} ({row['physics']})",
-            f"{row['num_seeds']} x {row['num_envs']}",
-            *(f"{rate:,.0f}" for rate in rates),
-            f"{row['training_to_physics']:.2f}",
-            f"{row['training_to_rollout']:.2f}",
-            f"{row['meta_gradient_to_policy_step']:.2f}",
-            f"{row['compile_seconds']:.1f}",
-            f"{row['peak_memory']:,.0f}",
-        )
-    show(table)
-
-
-def print_profiles(rows: Sequence[dict[str, Any]]) -> None:
-    """The parts of an iteration as a terminal table."""
-    from rich.table import Table
-
-    table = Table(
-        title="microseconds per environment step, all seeds together (ratio to physics)", title_justify="left"
-    )
-    table.add_column("part")
-    for row in rows:
-        table.add_column(f"{row['task']}, {row['num_seeds']} x {row['num_envs']}", justify="right")
-    for part in rows[0]["parts"]:
-        of_rows = [row["parts"][part] for row in rows]
-        table.add_row(part, *(f"{x['microseconds_per_step']:.2f} ({x['to_physics']:.2f})" for x in of_rows))
-    show(table)
-
-
 def _beside(setting: dict[str, Any], peer: peers.Peer, num_seeds: int) -> dict[str, Any]:
     """The row of ours that does a peer's work: its task and method, and batches of 2000 steps as there."""
     changes = {"batch_size": 2000}
     return {**setting, "task": peer.task, "method": peer.method, "num_seeds": num_seeds, "changes": changes}
 
 
-def print_peers(compared: Sequence[dict[str, Any]]) -> None:
-    """Peers and ours as a terminal table."""
-    from rich.table import Table
-
-    table = Table(title="training, environment steps per second", title_justify="left")
-    for title in ("trainer", "steps/s", "ours : it"):
-        table.add_column(title, justify="left" if title == "trainer" else "right")
-    for comparison in compared:
-        for way, rates in comparison["ways"].items():
-            table.add_row(f"{comparison['peer']}, {way}", " ".join(f"{rate:,.0f}" for rate in rates), "")
-        for seeds, rate in comparison["our_steps_per_second"].items():
-            ours = f"ours: {comparison['our_method']} on {comparison['task']}, {seeds} seed(s)"
-            table.add_row(ours, f"{rate:,.0f}", f"{comparison['ratio'][seeds]:.1f}")
-        table.add_section()
-    show(table)
-
-
 def run(arguments: argparse.Namespace) -> None:
     """Measures all rows, prints and writes them."""
     if arguments.row is not None:
-        setting = begin_row(arguments.row)
-        from experiments.speed import measuring  # imports JAX
-
-        if arguments.profile:
-            from experiments.speed import profiling
-
-            print(json.dumps(profiling.profile(measuring.Setting(**setting))))
-        else:
-            print(json.dumps(measuring.measure(measuring.Setting(**setting))))
+        _measure_here(arguments.row, profile=arguments.profile)
         return
     settings = settings_of(arguments)
     if arguments.jobs > 1 and (arguments.profile or arguments.peers):
         raise UsageError("--jobs: neither --profile nor --peers takes turns; leave it out")
+    if arguments.profile and arguments.peers:
+        raise UsageError("--profile: --peers measures other things instead; leave one of the two out")
     pythons = peers.find_pythons(arguments.peers) if arguments.peers else None
     command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
     command_line.check_writable(arguments.out.parent, "--out")
-    facts = facts_of_machine()
-    rows: list[dict[str, Any]] = []
+    facts = row_processes.facts_of_machine()
     if pythons:
-        compared = peers.compare(pythons, lambda peer, seeds: measure_row(_beside(settings[0], peer, seeds)))
-        rows = [row for comparison in compared for row in comparison.pop("our_rows")]
-        run_folder.write_json(arguments.out, {**facts, "rows": rows, "peers": compared})
-        print_peers(compared)
-        settings = []
-    failures, measured = [], {}
-    for index, row in _measured(settings, arguments.jobs, ["--profile"] if arguments.profile else []):
+        _compare(pythons, settings[0], arguments.out, facts)
+    else:
+        _measure(settings, arguments, facts)
+    print(f"written to {arguments.out}")
+
+
+def _measure_here(text: str, *, profile: bool) -> None:
+    """In a row's own process: measures the setting in `text` and prints the row."""
+    setting = row_processes.begin_row(text)
+    from experiments.speed import measuring, profiling  # import JAX
+
+    measure = profiling.profile if profile else measuring.measure
+    print(json.dumps(measure(measuring.Setting(**setting))))
+
+
+def _compare(pythons: Mapping[str, Path], setting: dict[str, Any], out: Path, facts: Mapping[str, Any]) -> None:
+    """Times the trainers of other packages and ours, with the options in `setting`."""
+    compared = peers.compare(pythons, lambda peer, seeds: row_processes.measure_row(_beside(setting, peer, seeds)))
+    rows = [row for comparison in compared for row in comparison.pop("our_rows")]
+    run_folder.write_json(out, {**facts, "rows": rows, "peers": compared})
+    tables.print_peers(compared)
+    tables.print_rows(rows)
+
+
+def _measure(settings: Sequence[dict[str, Any]], arguments: argparse.Namespace, facts: Mapping[str, Any]) -> None:
+    """Measures the settings. Raises `UsageError` for those that failed, after the others are written and printed."""
+    failures, measured, rows = [], {}, list[dict[str, Any]]()
+    own_options = ["--profile"] if arguments.profile else []
+    for index, row in row_processes.measure_rows(settings, arguments.jobs, own_options):
         if isinstance(row, UsageError):
             failures.append(str(row))
             continue
         measured[index] = row
         rows = [measured[i] for i in sorted(measured)]
-        run_folder.write_json(arguments.out, {**facts, "rows": rows})  # what is measured is kept if the rest is not
-    if rows and arguments.profile:
-        print_profiles(rows)
-    elif rows:
-        print_rows(rows)
+        run_folder.write_json(arguments.out, {**facts, "rows": rows})  # now, in case that a later row fails
+    if rows:
+        (tables.print_profiles if arguments.profile else tables.print_rows)(rows)
     if failures:
         raise UsageError("; ".join(failures))
-    print(f"written to {arguments.out}")
-
-
-def _measured(
-    settings: Sequence[dict[str, Any]], jobs: int, options: Sequence[str]
-) -> Iterator[tuple[int, dict[str, Any] | UsageError]]:
-    """Each setting's index and row, or why it has none, as they come; `jobs` of them compile side by side."""
-
-    def measure(setting: dict[str, Any]) -> dict[str, Any] | UsageError:
-        print(f"measuring {_name(setting)} ...", file=sys.stderr, flush=True)
-        try:
-            row = measure_row(setting, "benchmark", *options)
-        except UsageError as error:
-            return error
-        print(f"measured {_name(setting)}", file=sys.stderr, flush=True)
-        return row
-
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
-        turns = {"turns": str(Path(folder) / "turns")} if jobs > 1 else {}
-        coming = {pool.submit(measure, {**setting, **turns}): i for i, setting in enumerate(settings)}
-        for row in as_completed(coming):
-            yield coming[row], row.result()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -6,16 +6,17 @@ are written for other programs.
 """
 
 import argparse
-import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.demonstrations.trajectories import save_demonstrations
-from envs.registry import TASKS
+from envs.registry import TaskInfo
 from experiments.cli import command_line, xla
 from experiments.cli.command_line import Parser, UsageError
+from experiments.policies import evaluating
+from experiments.policies.evaluating import Loaded, Settings
 from experiments.runs import evaluations, recording, run_folder, summary
 from experiments.runs.run_folder import Run
 
@@ -82,30 +83,43 @@ def run(arguments: argparse.Namespace) -> None:
     if not arguments.run.is_dir():
         raise UsageError(f"RUN_DIR {arguments.run}: no such folder; give a folder that `train` wrote")
     stored = run_folder.read_run(arguments.run)
-    if stored.facts["task"] not in TASKS:
-        raise UsageError(f"RUN_DIR {arguments.run}: of task {stored.facts['task']}, which is not known here")
+    task = run_folder.task_of(stored)
     checkpoints = arguments.run / "checkpoints"
     if not checkpoints.is_dir() or not any(checkpoints.iterdir()):
         raise UsageError(f"RUN_DIR {arguments.run}: holds no checkpoint; train first, or resume with `train --resume`")
     path = arguments.out or arguments.run / "evaluation.json"
     evaluations.read(path)
-    if arguments.simulator == "original" and TASKS[stored.facts["task"]].family == "safety_gym":
-        raise UsageError(
-            "--simulator original: safety-gymnasium needs an environment of its own; use --export FILE and run there "
-            "`python tests/golden/run_policy.py FILE`"
-        )
+    if arguments.simulator == "original":
+        check_original(task)
     files = check_files(arguments, path)
     described = describe_recording(arguments, stored)
     for option, file in files:
         command_line.check_writable(file.parent, option)
-    content, reference = evaluate_run(stored, arguments, described)
+    xla.spread_seeds(stored.facts["num_seeds"])
+    loaded, settings = evaluating.load(stored), _settings(arguments)
+    episodes = evaluating.play(loaded, settings)
+    _export(arguments.export, loaded, episodes, evaluating.facts_of(loaded, settings))
+    if described:
+        _record(arguments, loaded, described)
+    content, reference = evaluating.judge(loaded, settings, episodes)
     title = (
-        f"{stored.config.method} on {stored.facts['task']}, {arguments.episodes} episodes per seed, "
+        f"{stored.config.method} on {task.name}, {arguments.episodes} episodes per seed, "
         f"{arguments.simulator} simulator"
     )
     summary.print_table(title, content["per_seed"], content["aggregate"], reference)
     evaluations.add(path, content)
     print(f"written to {path}")
+
+
+def check_original(task: TaskInfo) -> None:
+    """Raises `UsageError` where a task has no original simulator that runs beside this package."""
+    if task.original_package == "safety_gymnasium":
+        raise UsageError(
+            "--simulator original: safety-gymnasium needs an environment of its own; use --export FILE and run there "
+            "`python tests/golden/run_policy.py FILE`"
+        )
+    if task.original is None or task.original_package is None:
+        raise UsageError(f"--simulator original: task {task.name} has no original in gymnasium; leave it out")
 
 
 def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Path]]:
@@ -146,88 +160,43 @@ def describe_recording(arguments: argparse.Namespace, stored: Run) -> dict[str, 
     if arguments.simulator == "original":
         raise UsageError("--simulator original: demonstrations are recorded in ours; leave one of the two out")
     finished = recording.read_summary(stored)
-    rows, seed_index = finished["per_seed"], arguments.seed_index
-    if seed_index is None:
-        limit = recording.cost_limit(stored)
-        seed_index = recording.choose_seed(rows, limit)
-        if seed_index is None:
-            costs = ", ".join(f"seed {row['seed']}: {row['episode_cost']:g}" for row in rows)
-            raise UsageError(
-                f"--record: no seed keeps the cost limit {limit:g} ({costs}); choose one by --seed-index N"
-            )
-    if seed_index not in [row["seed"] for row in rows]:
-        raise UsageError(f"--seed-index {seed_index}: the run has {len(rows)} seed(s); give 0 to {len(rows) - 1}")
+    seed_index = recording.find_seed(stored, finished["per_seed"], arguments.seed_index)
     command = "\n".join([stored.facts["command"], command_line.command()])
     return recording.facts(stored, finished, seed_index, command)
 
 
-def evaluate_run(
-    stored: Run, arguments: argparse.Namespace, described: Mapping[str, Any] | None = None
-) -> tuple[dict[str, Any], summary.Reference]:
-    """Runs the episodes and writes policies and, where they are `described`, demonstrations.
+def _settings(arguments: argparse.Namespace) -> Settings:
+    return Settings(
+        simulator=arguments.simulator,
+        num_episodes=arguments.episodes,
+        seed=arguments.seed,
+        deterministic=arguments.deterministic,
+        shared_episodes=arguments.shared_episodes,
+    )
 
-    Returns the entry for the result file and the levels to compare with.
-    """
-    import envs  # imports JAX: not before the input has been checked
-    from ccil_jax.acting import evaluation
-    from ccil_jax.training import runner
-    from experiments.policies import exporting, original_simulator
 
-    xla.spread_seeds(stored.facts["num_seeds"])
-    env = envs.make(stored.facts["task"], physics=stored.facts["physics"], **stored.facts["env_options"])
-    loaded = runner.load(stored.config, env, stored.folder.resolve() / "checkpoints", stored.facts["num_seeds"])
-    settings: dict[str, Any] = {
-        "num_episodes": arguments.episodes,
-        "seed": arguments.seed,
-        "deterministic": arguments.deterministic,
-    }
-    recorded = {**settings, "shared_episodes": arguments.shared_episodes}
-    draws = [0] * stored.facts["num_seeds"] if arguments.shared_episodes else None
-    if arguments.simulator == "ours":
-        evaluated: Any = evaluation.evaluate(loaded.config, loaded.actor, env, draws=draws, **settings)
-    else:
-        contact_cost = stored.facts["env_options"].get("contact_cost", True)
-        evaluated = original_simulator.evaluate(
-            loaded.config, loaded.actor, env, draws=draws, contact_cost=contact_cost, **settings
-        )
-    provenance = run_folder.provenance()
-    facts = {
-        "task": env.name,
-        "original": TASKS[env.name].original,
-        "simulator": arguments.simulator,
-        **recorded,
-        **provenance,
-    }
-    for file in arguments.export:
+def _export(files: Sequence[Path], loaded: Loaded, episodes: Any, facts: dict[str, Any]) -> None:
+    from experiments.policies import exporting  # imports JAX
+
+    for file in files:
         if file.suffix == ".npz":
-            exporting.export_numpy(file, loaded.config, loaded.actor, env, evaluated, facts)
+            exporting.export_numpy(file, loaded.config, loaded.actor, loaded.env, episodes, facts)
         else:
-            exporting.export_stablehlo(file, loaded.config, loaded.actor, env)
+            exporting.export_stablehlo(file, loaded.config, loaded.actor, loaded.env)
         print(f"policies {file}")
-    if described:
-        demonstrations = recording.record(
-            loaded.config,
-            loaded.actor,
-            env,
-            num_trajectories=arguments.num_trajectories or _NUM_TRAJECTORIES,
-            episode_seed=(arguments.seed + 1) % 2**32,  # other episodes than those that judge the policy
-            facts=described,
-        )
-        save_demonstrations(arguments.record, demonstrations)
-        recording.print_demonstrations(demonstrations, arguments.record)
-    random = evaluation.random_policy(env, num_episodes=arguments.episodes, seed=arguments.seed)
-    reference = summary.make_reference(stored.facts, random, stored.config.prescribed_limit)
-    rows = summary.per_seed_scores(evaluated, None, reference)
-    return {
-        "run": str(stored.folder.resolve()),
-        "simulator": arguments.simulator,
-        **recorded,
-        **provenance,
-        **dataclasses.asdict(reference),
-        "per_seed": rows,
-        "aggregate": summary.aggregate_scores(rows),
-        "violation_beyond_error": summary.mean_violation_beyond_error(rows, reference),
-    }, reference
+
+
+def _record(arguments: argparse.Namespace, loaded: Loaded, described: Mapping[str, Any]) -> None:
+    demonstrations = recording.record(
+        loaded.config,
+        loaded.actor,
+        loaded.env,
+        num_trajectories=arguments.num_trajectories or _NUM_TRAJECTORIES,
+        episode_seed=(arguments.seed + 1) % 2**32,  # other episodes than those that judge the policy
+        facts=described,
+    )
+    save_demonstrations(arguments.record, demonstrations)
+    recording.print_demonstrations(demonstrations, arguments.record)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.demonstrations.trajectories import save_demonstrations
+from envs.registry import TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
@@ -22,8 +23,7 @@ from experiments.runs.plans import RunPlan, make_setup
 from experiments.runs.recording import choose_seed, facts, print_demonstrations, record
 from experiments.runs.resuming import resumed
 
-PRESETS = {"locomotion": "expert", "safety_gym": "safety_gym_expert"}  # of each family
-DEFAULTS = {**options.DEFAULTS, "preset": PRESETS["locomotion"]}
+DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
 # What --resume may change: an expert that misses its limit goes on under another one, or with a stronger multiplier.
 MOVABLE = (
     "cost_limit",
@@ -67,8 +67,8 @@ def make_plan(arguments: argparse.Namespace) -> RunPlan:
     saved = _resumed(arguments.run_dir, given) if arguments.resume else {}
     choices = {**DEFAULTS, "env": None, **saved, **given}
     task = options.find_task(choices["env"])
-    limit = {} if arguments.unconstrained or "cost_limit" in choices else {"cost_limit": task.cost_limit}
-    preset = {**saved, **given}.get("preset", PRESETS[task.family])
+    limit = {} if arguments.unconstrained or "cost_limit" in choices else {"cost_limit": _limit_of(task)}
+    preset = {**saved, **given}.get("preset", task.expert_preset)
     config = options.config_from({**given, **limit}, preset, saved)
     env_options = options.env_options(choices, task)
     command_line.check_writable(arguments.out.parent, "--out")
@@ -82,6 +82,16 @@ def make_plan(arguments: argparse.Namespace) -> RunPlan:
         resume=arguments.resume,
         command=command_line.command(),
     )
+
+
+def _limit_of(task: TaskInfo) -> float:
+    """The cost limit of a task's experts, where none is given. Raises `UsageError` for a task without a default."""
+    if task.cost_limit is None:
+        raise UsageError(
+            f"--cost-limit: required, as {task.name} has no default; give the mean cost that an episode may have, or "
+            "add --unconstrained"
+        )
+    return task.cost_limit
 
 
 def _resumed(folder: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:

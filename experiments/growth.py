@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from ccil_jax.methods import METHODS
-from experiments import benchmark
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser
 from experiments.cli.tables import show
 from experiments.runs import run_folder
+from experiments.speed import row_processes
 
 DEMONSTRATIONS = 10_000  # steps, where they do not vary
 AXES: Mapping[str, tuple[int, ...]] = {
@@ -141,17 +141,17 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Measures all points, prints, draws and writes them."""
     if arguments.row is not None:
-        setting = benchmark.begin_row(arguments.row)
+        setting = row_processes.begin_row(arguments.row)
         from experiments.speed import measuring  # imports JAX
 
         print(json.dumps(measuring.measure_training(measuring.Setting(**setting))))
         return
     points = settings_of(arguments)
     command_line.check_output_folder(arguments.out, record="growth.json")
-    facts, rows = benchmark.facts_of_machine(), list[dict[str, Any]]()
+    facts, rows = row_processes.facts_of_machine(), list[dict[str, Any]]()
     for axis, value, setting in points:
         print(f"measuring {axis} {value:,} ...", file=sys.stderr, flush=True)
-        rows.append({"axis": axis, "value": value, **benchmark.measure_row(setting, "growth")})
+        rows.append({"axis": axis, "value": value, **row_processes.measure_row(setting, "growth")})
         content = {**facts, "rows": rows, "exponents": exponents_of(rows)}
         run_folder.write_json(arguments.out / "growth.json", content)
     title = f"{arguments.method} on {rows[0]['task']}: cost of an iteration, relative to the smallest"

@@ -35,6 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
 def replay(path: Path, demos: Path | None = None) -> list[str]:
     """One unguarded iteration from the state in `path`: names of the metrics and parts of the state not finite."""
     run = run_folder.parse_run(path, fault_files.read_facts(path))
+    task = run_folder.task_of(run)
     demonstrations = _demonstrations(run.facts["demonstrations"], demos)
 
     import jax
@@ -44,7 +45,7 @@ def replay(path: Path, demos: Path | None = None) -> list[str]:
     from ccil_jax.agents.expert import expert_data
     from ccil_jax.training import guard
 
-    env = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
+    env = envs.make(task.name, physics=run.facts["physics"], **run.facts["env_options"])
     config = build.resolve(run.config, env, demonstrations)
     agent = build.make(config, env, expert_data(demonstrations))
     state = fault_files.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))

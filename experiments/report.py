@@ -1,70 +1,15 @@
 """One self-contained HTML page about finished runs: curves, metrics with intervals, every seed, what was different."""
 
 import argparse
-import dataclasses
-import html
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from ccil_jax.config import relevant
 from experiments.cli import command_line
-from experiments.cli.command_line import Parser, UsageError
-from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number
-from experiments.runs import run_folder
-from experiments.runs.intervals import bootstrap_interval
-from experiments.runs.labels import distinct_names
-from experiments.runs.run_folder import Run
-
-_NEEDED = {"num_seeds", "per_seed", "env_steps", "env_steps_per_second", "expert_cost"}  # of summary.json
-_COLUMNS = (
-    ("episode_return", "return"),
-    ("episode_cost", "cost"),
-    ("recovered_return", "recovered return, %"),
-    ("relative_cost_violation", "relative cost violation"),
-    ("penalized_return", "penalised return, %"),
-    ("cost_rate", "cost rate in training"),
-)
-_PAGE = "<meta name=generator content='ccil_jax report'>"
-_NOTE = (
-    "Runs: interquartile mean over seeds with its 95% bootstrap interval, [-] where there are too few seeds for one. "
-    "Seeds, expert and random policy: mean &plusmn; standard error over episodes. A dash: not known. Marked (*): a "
-    f"violation {html.escape(BEYOND_ERROR)}. What each number means is defined in docs/metrics.md of ccil_jax."
-)
-_STYLE = """
-:root { color-scheme: light; --ink: #22262b; --soft: #5b626c; --line: #e3e6ea; --accent: #0b6e99; }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); max-width: 1080px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.7rem; margin-bottom: .2rem; }
-h2 { font-size: 1.3rem; margin-top: 2.6rem; border-bottom: 2px solid var(--accent); padding-bottom: .2rem; }
-h3 { font-size: 1rem; margin: 1.6rem 0 .4rem; }
-p.note, figcaption { color: var(--soft); font-size: .9rem; max-width: 48rem; }
-figure { margin: 1rem 0; } img, canvas { max-width: 100%; }
-div.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
-th, td { padding: .3rem .7rem; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } thead th { color: var(--soft); font-weight: 600; }
-td .beyond { color: #a0281f; font-weight: 600; cursor: help; }
-td small { color: var(--soft); } details { margin: .6rem 0; } summary { cursor: pointer; color: var(--accent); }
-code { font-size: .86rem; background: #f4f6f8; padding: .05rem .3rem; white-space: pre-wrap; }
-"""
-
-
-@dataclasses.dataclass(frozen=True)
-class Entry:
-    """One finished run."""
-
-    run: Run
-    summary: dict[str, Any]
-    label: str  # no other run of this task has it
-    number: int  # no other run of this page has it
-
-    @property
-    def task(self) -> str:
-        """Name of the task."""
-        return str(self.run.facts["task"])
+from experiments.cli.command_line import Parser
+from experiments.cli.names import safe_name
+from experiments.page import document
+from experiments.page.entries import read_entries
 
 
 def make_parser() -> Parser:
@@ -89,252 +34,23 @@ def make_parser() -> Parser:
     return parser
 
 
-def read_entries(folders: Sequence[Path]) -> list[Entry]:
-    """Reads the runs. Raises `UsageError` for a folder that is not a finished run, or is given twice."""
-    entries: list[Entry] = []
-    for folder in folders:
-        if folder.resolve() in [e.run.folder.resolve() for e in entries]:
-            raise UsageError(f"RUN_DIR {folder}: the same folder twice; give each run once")
-        if not folder.is_dir():
-            raise UsageError(f"RUN_DIR {folder}: no such folder; give a folder that `train` wrote")
-        run = run_folder.read_run(folder)
-        if not (folder / "summary.json").is_file():
-            raise UsageError(f"RUN_DIR {folder}: not finished (no summary.json); finish it with `train --resume`")
-        entries.append(Entry(run, _read_summary(folder), run.config.method, len(entries)))
-    alike = ([other for other in entries if (other.task, other.label) == (e.task, e.label)] for e in entries)
-    return [_distinct(e, others) for e, others in zip(entries, alike, strict=True)]
-
-
-def _read_summary(folder: Path) -> dict[str, Any]:
-    path = folder / "summary.json"
-    summary = run_folder.read_json(path)
-    if missing := sorted(_NEEDED - summary.keys()):
-        raise UsageError(f"{path}: '{missing[0]}' is missing; the run folder is damaged, restore or repeat the run")
-    if run_folder.read_metrics(folder)["env_steps"].max() > summary["env_steps"]:
-        raise UsageError(f"RUN_DIR {folder}: continued and not finished; finish it with `train --resume`")
-    return summary
-
-
-def _distinct(entry: Entry, alike: Sequence[Entry]) -> Entry:
-    """The entry, its folder's name in its label where others (`alike`, itself included) would have the same."""
-    if len(alike) == 1:
-        return entry
-    names = distinct_names([e.run.folder for e in alike])
-    return dataclasses.replace(entry, label=f"{entry.label} ({names[alike.index(entry)]})")
-
-
-def draw_tasks(entries: Sequence[Entry]) -> dict[str, bytes]:
-    """The learning curves of each task, all runs overlaid: bytes of a PNG file by task, in the order of the runs."""
-    from experiments.runs import figures  # imports matplotlib
-
-    curves: dict[str, list[figures.Curve]] = {}
-    for e in entries:
-        curves.setdefault(e.task, []).append(figures.read_curve(e.run.folder, e.label))
-    return {task: figures.png(figures.draw_panels(drawn, task)) for task, drawn in curves.items()}
-
-
-def page(
-    entries: Sequence[Entry],
-    images: Mapping[str, bytes],
-    *,
-    seed: int = 0,
-    player: Callable[[Entry], str] | None = None,
-) -> str:
-    """The whole page, with a PNG for each task; `player` gives the HTML of an episode of a run, or an empty string."""
-    tasks = list(images)
-    parts = [
-        "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
-        "<meta name=viewport content='width=device-width, initial-scale=1'>",
-        _PAGE,
-        f"<title>{_text(', '.join(tasks))}: imitation under cost constraints</title>",
-        f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{_text(', '.join(tasks))}: imitation under cost constraints</h1>",
-        f"<p class=note>{_NOTE}</p>",
-    ]
-    if len(tasks) > 1:
-        parts.append(_across_tasks(entries, seed))
-    for task in tasks:
-        parts += _task_section(task, [e for e in entries if e.task == task], images[task], seed, player)
-    return "\n".join([*parts, "</body></html>\n"])
-
-
-def _task_section(
-    task: str, entries: Sequence[Entry], image: bytes, seed: int, player: Callable[[Entry], str] | None
-) -> Iterable[str]:
-    from experiments.runs import figures  # imports matplotlib
-
-    yield f"<h2>{_text(task)}</h2>"
-    several = any(len(e.summary["per_seed"]) > 1 for e in entries)
-    seeds = "Thick: mean over seeds. Band: standard deviation. Thin: every seed. " if several else ""
-    yield (
-        f"<figure>{figures.html_image(image, f'Learning curves on {task}')}<figcaption>{seeds}"
-        "Dashed: mean of the demonstrations, with its standard error where that is known.</figcaption></figure>"
-    )
-    yield _metrics_table(entries, seed)
-    yield from (text for e in entries if player and (text := player(e)))
-    yield "<details><summary>Every seed</summary>" + _seeds_table(entries) + "</details>"
-    yield "<details><summary>How the runs differ, and where they were made</summary>" + _differences(entries)
-    yield "</details>"
-
-
-def _metrics_table(entries: Sequence[Entry], seed: int) -> str:
-    rows = []
-    for e in entries:
-        cells = [_text(e.label), _text(str(e.summary["num_seeds"]))]
-        for name, _ in _COLUMNS:
-            values = [row.get(name) for row in e.summary["per_seed"]]
-            text = "-" if None in values else _interval([np.array(values)], seed)
-            cells.append(_marked(text, name, e.summary.get("violation_beyond_error")))
-        cells += [f"{e.summary['env_steps']:,}", _rate(e.summary["env_steps_per_second"])]
-        rows.append(cells)
-    width = 2 + len(_COLUMNS) + 2
-    rows += [[*cells, *[""] * (width - len(cells))] for cells in _reference_rows(entries)]
-    return _table(["", "seeds", *(title for _, title in _COLUMNS), "steps per seed", "steps/s"], rows)
-
-
-def _reference_rows(entries: Sequence[Entry]) -> Iterable[list[str]]:
-    """Label, no seeds, return and cost of what the runs are measured against: a row for each level that differs."""
-    for name, title in (("expert", "expert"), ("random", "random policy"), ("cost_limit", "cost limit")):
-        runs: dict[tuple[str, str], list[str]] = {}
-        for e in entries:
-            if name == "cost_limit":
-                cells = "", number(e.summary.get(name))
-            else:
-                cells = _with_error(e.summary, f"{name}_return"), _with_error(e.summary, f"{name}_cost")
-            runs.setdefault(cells, []).append(e.label)
-        for cells, labels in runs.items():
-            if set(cells) - {"", "-"}:
-                yield [title if len(runs) == 1 else _text(f"{title} of {', '.join(labels)}"), "", *cells]
-
-
-def _across_tasks(entries: Sequence[Entry], seed: int) -> str:
-    """Methods that were run on several tasks: seeds are resampled within each task."""
-    rows = []
-    for method in dict.fromkeys(e.run.config.method for e in entries):
-        chosen = [e for e in entries if e.run.config.method == method]
-        cells = [_text(method), str(len({e.task for e in chosen}))]
-        for name in ("recovered_return", "relative_cost_violation", "penalized_return"):
-            strata = [np.array([row.get(name) for row in e.summary["per_seed"]], np.float64) for e in chosen]
-            cells.append(_interval(strata, seed) if all(np.isfinite(s).all() for s in strata) else "-")
-        rows.append(cells)
-    titles = ["", "tasks", "recovered return, %", "relative cost violation", "penalised return, %"]
-    return "<h2>Across tasks</h2>" + _table(titles, rows)
-
-
-def _seeds_table(entries: Sequence[Entry]) -> str:
-    rows = [
-        [_text(f"{e.label}, seed {row['seed']}"), *(_seed_cell(row, name) for name, _ in _COLUMNS)]
-        for e in entries
-        for row in e.summary["per_seed"]
-    ]
-    return _table(["", *(title for _, title in _COLUMNS)], rows)
-
-
-def _seed_cell(row: Mapping[str, Any], name: str) -> str:
-    text = _with_error(row, name) if name in ("episode_return", "episode_cost") else number(row.get(name))
-    return _marked(text, name, row.get("violation_beyond_error"))
-
-
-def _with_error(content: Mapping[str, Any], name: str) -> str:
-    """A mean and its standard error, which earlier versions did not write."""
-    if content.get(name) is None:
-        return "-"
-    return f"{number(content[name])} <small>&plusmn; {number(content.get(f'{name}_standard_error'))}</small>"
-
-
-def _marked(text: str, name: str, beyond_error: bool | None) -> str:
-    """The text of a cell; a violation that is no scatter of the demonstrations is marked."""
-    if name != "relative_cost_violation" or not beyond_error:
-        return text
-    return f"<span class=beyond title='{_text(BEYOND_ERROR)}'>{marked(text, beyond_error)}</span>"
-
-
-def _differences(entries: Sequence[Entry]) -> str:
-    fields = [relevant(e.run.config) for e in entries]  # a run without a field shows a dash
-    names = [name for name in dataclasses.asdict(entries[0].run.config) if any(name in f for f in fields)]
-    differing = [name for name in names if len({repr(f.get(name, "-")) for f in fields}) > 1]
-    rows = [[_text(name), *(_text(str(f.get(name, "-"))) for f in fields)] for name in differing]
-    text = _table(["field", *(_text(e.label) for e in entries)], rows) if rows else "<p>All fields are equal.</p>"
-    for e in entries:
-        facts, demos = e.run.facts, e.run.facts["demonstrations"]
-        versions = ", ".join(f"{k} {v}" for k, v in facts["versions"].items())
-        text += (
-            f"<h3>{_text(e.label)}</h3><p><code>{_text(facts['command'])}</code></p><p class=note>"
-            f"physics {_text(facts['physics'])}, device {_text(facts['device']['kind'])}, "
-            f"commit {_text(str(facts['git_commit']))}, {_text(versions)}"
-            + (
-                f", demonstrations sha256 {_text(demos['sha256'])}, {_text(str(demos['num_episodes']))} trajectories"
-                if demos
-                else ""
-            )
-            + "</p>"
-        )
-    return text
-
-
-def _interval(strata: Sequence[np.ndarray], seed: int) -> str:
-    interval = bootstrap_interval(strata, seed=seed)
-    return f"{number(interval.value)} <small>{bounds(interval.low, interval.high)}</small>"
-
-
-def _rate(steps_per_second: float | None) -> str:
-    return "-" if steps_per_second is None else f"{steps_per_second:,.0f}"
-
-
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{title}</th>" for title in titles)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<div class=wide><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
-
-
-def _text(value: str) -> str:
-    return html.escape(value, quote=True)
-
-
-def animate(entry: Entry) -> str:
-    """The HTML of an episode of the seed with the highest return, or an empty string for a run without checkpoints."""
-    if not (entry.run.folder / "checkpoints").is_dir():
-        return ""
-    from experiments.page import animation  # imports JAX: only where an episode is asked for
-
-    best, caption = choose_seed(entry)
-    return animation.play_run(entry.run, best, f"episode-{entry.number}", caption)
-
-
-def choose_seed(entry: Entry) -> tuple[int, str]:
-    """The seed whose episode is shown, and a caption that says why."""
-    rows = entry.summary["per_seed"]
-    best = max(rows, key=lambda row: -np.inf if row["episode_return"] is None else row["episode_return"])["seed"]
-    why = f", which has the highest mean return of {len(rows)} seeds" if len(rows) > 1 else ""
-    return best, f"One episode of {entry.label}, seed {best}{why}."
-
-
-def is_page(path: Path) -> bool:
-    """Whether the file was written by this launcher, so that a newer page may take its place."""
-    try:
-        with path.open("rb") as file:
-            return _PAGE.encode() in file.read(500)
-    except OSError:
-        return False
-
-
 def _figure(folder: Path, task: str) -> Path:
-    return folder / f"{Path(task).name}.png"  # a name from a file does not choose the folder
+    return folder / f"{safe_name(task)}.png"
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Reads the runs and writes the page."""
     entries = read_entries(arguments.runs)
     path = arguments.out or (arguments.runs[0] if len(entries) == 1 else Path()) / "report.html"
-    command_line.check_new_file(path, "--out", overwrite=arguments.overwrite or is_page(path))
+    command_line.check_new_file(path, "--out", overwrite=arguments.overwrite or document.is_page(path))
     command_line.check_writable(path.parent, "--out")
     if arguments.figures:
         for task in {e.task for e in entries}:
             command_line.check_new_file(_figure(arguments.figures, task), "--figures", overwrite=arguments.overwrite)
         command_line.check_writable(arguments.figures, "--figures")
-    images = draw_tasks(entries)
-    player = None if arguments.no_animation else animate
-    path.write_text(page(entries, images, seed=arguments.seed, player=player), encoding="utf-8")
+    images = document.draw_tasks(entries)
+    player = None if arguments.no_animation else document.animate
+    path.write_text(document.page(entries, images, seed=arguments.seed, player=player), encoding="utf-8")
     print(f"page    {path}")
     if arguments.figures:
         for task, image in images.items():

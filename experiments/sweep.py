@@ -32,6 +32,7 @@ from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.errors import UserError
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
+from experiments.cli.names import safe_name
 from experiments.sweeps import comparison, dispatch
 from experiments.sweeps.variants import Variant, make_variant, run_of, text
 
@@ -121,7 +122,7 @@ def variants_of(path: Path, spec: Mapping[str, Any], out: Path) -> dict[str, tup
     found: dict[str, tuple[Variant, dict[str, Any]]] = {}
     names: dict[Hashable, str] = {}
     for i, point in enumerate(points(spec["grid"])):
-        name = ",".join(f"{field}={text(value)}" for field, value in point.items()).replace("/", "_")
+        name = safe_name(",".join(f"{field}={text(value)}" for field, value in point.items()))
         name = name if len(name) <= _LONGEST_NAME else f"variant_{i}"
         try:
             variant = make_variant(name, {**common, **point}, out, load=load)

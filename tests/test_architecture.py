@@ -108,7 +108,7 @@ def test_packages_import_only_downwards(name: str) -> None:
 def wing_of(name: str) -> str:
     """The folder of its package that a module is in; "" for a file beside the folders."""
     parts = name.split(".")
-    return parts[1] if len(parts) > 2 or SOURCES[name].name == "__init__.py" else ""
+    return parts[1] if len(parts) > 2 or (len(parts) == 2 and SOURCES[name].name == "__init__.py") else ""
 
 
 @pytest.mark.parametrize("name", [name for name in SOURCES if name.partition(".")[0] in WINGS and "." in name])
@@ -267,3 +267,44 @@ def test_one_place_says_the_version() -> None:
     place = ROOT / settings["tool"]["hatch"]["version"]["path"]
     assert place == SOURCES["ccil_jax"]
     assert len(re.findall(r'^__version__ = "\d+\.\d+\.\d+"$', place.read_text(encoding="utf-8"), re.MULTILINE)) == 1
+
+
+def test_editors_know_the_public_names_that_are_imported_lazily() -> None:
+    """What a type checker sees of `ccil_jax` is what is there at run time."""
+    import ccil_jax
+
+    conditions = (node for node in TREES["ccil_jax"].body if isinstance(node, ast.If))
+    (block,) = (node for node in conditions if ast.unparse(node.test) == "TYPE_CHECKING")
+    seen = {
+        alias.asname: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    assert seen == ccil_jax._HOMES
+
+
+def test_the_readme_draws_the_folders_in_the_order_of_their_imports() -> None:
+    """From top to bottom; the ground, which others import from, stands last."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    drawing = text.partition("## Architecture")[2].split("```")[1]
+    for package, wings in WINGS.items():
+        section = re.search(rf"^{package}/.*?(?=^\S|\Z)", drawing, re.MULTILINE | re.DOTALL)
+        assert section
+        drawn = re.findall(r"^  (\w+)/", section[0], re.MULTILINE)
+        assert drawn == [wing for wing in reversed(wings) if wing]
+    launchers = drawing.partition("Wrong input")[0].partition("one file each:")[2].replace(".", "").split()
+    assert sorted(launchers) == sorted(
+        name.removeprefix("experiments.") for name in SOURCES if name.startswith("experiments.") and not wing_of(name)
+    )
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_function_has_more_than_sixty_lines(name: str) -> None:
+    """Its docstring aside."""
+    functions = [node for node in ast.walk(TREES[name]) if isinstance(node, ast.FunctionDef)]
+    assert [node.name for node in functions if length(node) > 60] == []
+
+
+def length(function: ast.FunctionDef) -> int:
+    first = function.body[0]
+    is_docstring = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+    described = (first.end_lineno or 0) - first.lineno + 1 if is_docstring else 0
+    return (function.end_lineno or 0) - function.lineno + 1 - described

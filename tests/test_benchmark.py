@@ -13,7 +13,7 @@ import pytest
 
 from experiments import benchmark, growth
 from experiments.cli.command_line import UsageError
-from experiments.speed import peers
+from experiments.speed import peers, row_processes, tables
 from experiments.speed.peers import Peer
 from experiments.speed.turns import turn
 from tests.processes import command_lines, in_proc
@@ -89,8 +89,8 @@ def test_rows_that_fail_do_not_spoil_the_others(
                 time.sleep(0.01)
         return {"num_envs": setting["num_envs"]}
 
-    monkeypatch.setattr(benchmark, "measure_row", measure_row)
-    monkeypatch.setattr(benchmark, "print_rows", lambda rows: print([row["num_envs"] for row in rows]))
+    monkeypatch.setattr(row_processes, "measure_row", measure_row)
+    monkeypatch.setattr(tables, "print_rows", lambda rows: print([row["num_envs"] for row in rows]))
     sizes = ["--num-seeds", "1", "--num-envs", "16", "32", "64"]
     with pytest.raises(SystemExit) as end:
         benchmark.main(["--tasks", "Swimmer", *sizes, "--jobs", "3", "--out", str(out)])
@@ -168,7 +168,7 @@ def test_growth_measures_one_axis_at_a_time(tmp_path: Path, monkeypatch: pytest.
             "training_steps_per_second": 1.0,
         }
 
-    monkeypatch.setattr(benchmark, "measure_row", measure_row)
+    monkeypatch.setattr(row_processes, "measure_row", measure_row)
     arguments = ["--axes", "seeds", "width", "--largest", "128", "--env", "Swimmer"]
     assert growth.main([*arguments, "--out", str(tmp_path / "g")]) == 0
     assert [s["num_seeds"] for s in measured] == [1, 2, 4, 8, 16, 32, 64, 1, 1, 1]

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import typing
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config, field_names, unused, validate, with_limit_of
 from ccil_jax.errors import ConfigError
+from ccil_jax.fields import Fields
 from ccil_jax.methods import METHODS
 from ccil_jax.presets import PRESETS
 from experiments import ablations, expert, sweep, train
@@ -278,3 +280,7 @@ def test_the_methods_with_a_multiplier() -> None:
     }
     assert not Config(method="ccil", multiplier_update="optimal").has_multiplier
     assert Config(method="ccil", multiplier_update="pid").has_multiplier
+
+
+def test_the_keywords_that_editors_know_are_the_fields() -> None:
+    assert typing.get_type_hints(Fields) == typing.get_type_hints(Config)

@@ -51,7 +51,7 @@ def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleTyp
     preset = re.search(r"hyperparameters to start from \(default: (\w+)\)", text)
     assert preset
     assert PRESETS[preset[1]].get("batch_size", Config().batch_size) == batch_size
-    assert f"K (Table 1) (default: {batch_size}; static)" in text
+    assert f"batch of its own (Table 1) (default: {batch_size}; static)" in text
 
 
 def _every_option() -> list[str]:
@@ -227,7 +227,7 @@ def test_exported_policies_are_the_learnt_ones(
     from ccil_jax.acting import networks
     from ccil_jax.acting.rollout import act
     from ccil_jax.training import runner
-    from experiments.policies.original_simulator import policies
+    from experiments.policies.numpy_policy import policies
 
     files = [str(tmp_path / name) for name in ("policy.npz", "policy.stablehlo")]
     assert evaluate.main([f"{pipeline}/malm", "--episodes", "2", "--export", *files]) == 0
@@ -269,7 +269,7 @@ def test_numpy_policy_is_the_learnt_policy() -> None:
 
     from ccil_jax.acting import networks, running_statistics
     from ccil_jax.acting.rollout import Actor, act
-    from experiments.policies.original_simulator import NumpyPolicy
+    from experiments.policies.numpy_policy import NumpyPolicy
 
     random = np.random.default_rng(0)
     for activation in ("tanh", "relu", "swish"):
@@ -290,7 +290,7 @@ def test_the_numpy_policy_of_iq_learn_is_the_jax_policy() -> None:
     import envs
     from ccil_jax.acting import networks
     from ccil_jax.acting.rollout import Actor, act
-    from experiments.policies.original_simulator import NumpyPolicy
+    from experiments.policies.numpy_policy import NumpyPolicy
 
     env = envs.make("Hopper")
     config = Config(method="iq_learn", hidden_sizes=(16, 8), activation="relu")

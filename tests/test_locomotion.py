@@ -11,14 +11,6 @@ import envs
 from envs.base import State
 
 NUM_ENVS = 8
-NOISE = {  # half-width of qpos, scale of qvel, whether qvel is normal
-    "Swimmer": (0.1, 0.1, False),
-    "HalfCheetah": (0.1, 0.1, True),
-    "Hopper": (5e-3, 5e-3, False),
-    "Walker2d": (5e-3, 5e-3, False),
-    "Ant": (0.1, 0.1, True),
-    "Humanoid": (1e-2, 1e-2, False),
-}
 
 
 @pytest.fixture(scope="module", params=[name for name, info in envs.TASKS.items() if info.family == "locomotion"])
@@ -27,9 +19,10 @@ def env(request: pytest.FixtureRequest) -> Any:
 
 
 def test_reset_noise(env: Any) -> None:
+    """As the row says; that the row says what gymnasium does is tested with the parity."""
     keys = jax.random.split(jax.random.key(1), 500)
     physics = jax.jit(jax.vmap(env.reset))(keys).physics
-    width, scale, normal = NOISE[env.name]
+    width, scale, normal = env.task.qpos_noise, env.task.qvel_noise, env.task.qvel_normal
     offset = physics.qpos - env.model.qpos0
     assert np.abs(offset).max() <= width * 1.0001
     np.testing.assert_allclose(np.std(offset, axis=0), width / np.sqrt(3), rtol=0.15)

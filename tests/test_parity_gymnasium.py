@@ -7,6 +7,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+import scipy.stats
 
 import envs
 
@@ -14,7 +15,6 @@ pytest.importorskip("imageio", reason="gymnasium's MuJoCo tasks import it")
 gymnasium = pytest.importorskip("gymnasium")
 
 NUM_STATES = 200
-CONTACT_TASKS = ("Ant", "Humanoid")
 LOCOMOTION = [name for name, info in envs.TASKS.items() if info.family == "locomotion"]
 TERMS = {
     "forward": "reward_forward",
@@ -27,10 +27,10 @@ NATIVE: Any = {"rtol": 1e-5, "atol": 1e-6}
 
 
 def make_original(name: str) -> Any:
-    options = {"include_cfrc_ext_in_observation": False} if name in CONTACT_TASKS else {}
+    task = envs.TASKS[name]
     mujoco.set_mju_user_warning(lambda _: None)  # a model's deprecated attribute would go to a log file here
     try:
-        return gymnasium.make(envs.TASKS[name].original, **options).unwrapped
+        return gymnasium.make(task.original, **task.original_options).unwrapped
     finally:
         mujoco.set_mju_user_warning(None)
 
@@ -105,6 +105,20 @@ def independent_reward(name: str, info: dict[str, float]) -> float:
     if name in ("Swimmer", "Walker2d"):
         return info["reward_forward"] + info["reward_ctrl"] + info.get("reward_survive", 0.0)
     return info["reward_forward"] + info.get("reward_survive", 0.0)
+
+
+@pytest.mark.parametrize("name", LOCOMOTION)
+def test_starts_are_distributed_as_gymnasiums(name: str) -> None:
+    """Kolmogorov-Smirnov, each coordinate by itself: the smallest p of n must be as of n uniform ones."""
+    original, env = make_original(name), envs.make(name, physics="native")
+    theirs = []
+    for seed in range(300):
+        original.reset(seed=seed)
+        theirs.append(np.concatenate([original.data.qpos, original.data.qvel]))
+    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(4), 300)).physics
+    ours = np.concatenate([starts.qpos, starts.qvel], axis=1)
+    p_values = [scipy.stats.ks_2samp(a, b).pvalue for a, b in zip(ours.T, np.array(theirs).T, strict=True)]
+    assert min(p_values) > 1e-3 / len(p_values)
 
 
 @pytest.mark.parametrize("name", LOCOMOTION)

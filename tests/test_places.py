@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import pytest
 
-from experiments import convert
+from experiments import convert, expert, train
 from experiments.cli import command_line, xla
 from experiments.cli.command_line import UsageError
 
@@ -66,3 +66,17 @@ def test_a_folder_that_cannot_be_made_is_wrong_input(tmp_path: Path, monkeypatch
     Path("runs").write_text("a file")
     with pytest.raises(UsageError, match=r"--run-dir runs/Swimmer_expert_\S+: cannot be written \(File exists\)"):
         command_line.default_folder("Swimmer", "expert", "--run-dir")
+
+
+def test_a_run_that_is_refused_leaves_no_folder_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints cannot be kept below a folder with [ in its name."""
+    folder = tmp_path / "lr[0.1]"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    for launcher, given in (
+        (train, ["--method", "bc"]),
+        (expert, ["--out", str(tmp_path / "expert.npz")]),
+    ):
+        with pytest.raises(SystemExit):
+            launcher.main(["--env", "Swimmer", *given])
+        assert list(folder.iterdir()) == []

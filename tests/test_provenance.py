@@ -10,10 +10,10 @@ import pytest
 
 import ccil_jax
 from ccil_jax.training.versions import versions
-from experiments.runs import run_folder
+from experiments.runs import provenance
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
-HERE = Path(run_folder.__file__).parents[2]
+HERE = Path(provenance.__file__).parents[2]
 
 
 def install(monkeypatch: pytest.MonkeyPatch, folder: Path, direct_url: dict[str, Any] | None) -> None:
@@ -21,7 +21,7 @@ def install(monkeypatch: pytest.MonkeyPatch, folder: Path, direct_url: dict[str,
     text = None if direct_url is None else json.dumps(direct_url)
     found = SimpleNamespace(locate_file=lambda name: folder / name, read_text=lambda name: text)
     monkeypatch.setattr(importlib.metadata, "distribution", lambda name: found)
-    monkeypatch.setattr(run_folder, "_checkout_commit", lambda: None)
+    monkeypatch.setattr(provenance, "_checkout_commit", lambda: None)
 
 
 @pytest.mark.parametrize(
@@ -36,20 +36,20 @@ def test_an_installation_knows_the_commit_that_pip_built(
     direct_url: dict[str, Any] | None, commit: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(monkeypatch, HERE, direct_url)
-    assert run_folder.git_commit() == commit
+    assert provenance.git_commit() == commit
 
 
 def test_a_wheel_says_which_commit_it_was_built_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(monkeypatch, HERE, {"url": "file:///wheel", "archive_info": {}})
     (tmp_path / "ccil_jax").mkdir()
     (tmp_path / "ccil_jax" / "COMMIT").write_text(f"{COMMIT}-dirty\n")
-    monkeypatch.setattr(run_folder, "__file__", str(tmp_path / "experiments" / "runs" / "run_folder.py"))
-    assert run_folder.git_commit() == f"{COMMIT}-dirty"
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "experiments" / "runs" / "provenance.py"))
+    assert provenance.git_commit() == f"{COMMIT}-dirty"
 
 
 def test_the_commit_of_another_installation_is_not_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     install(monkeypatch, tmp_path, {"vcs_info": {"commit_id": COMMIT}})
-    assert run_folder.git_commit() is None
+    assert provenance.git_commit() is None
 
 
 def test_sources_that_nobody_installed_have_no_commit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,9 +58,9 @@ def test_sources_that_nobody_installed_have_no_commit(monkeypatch: pytest.Monkey
 
     install(monkeypatch, HERE, None)
     monkeypatch.setattr(importlib.metadata, "distribution", missing)
-    assert run_folder.git_commit() is None
+    assert provenance.git_commit() is None
 
 
 def test_versions_name_the_package_itself() -> None:
     assert versions()["ccil_jax"] == ccil_jax.__version__
-    assert run_folder.provenance().keys() == {"command", "versions", "git_commit"}
+    assert provenance.provenance().keys() == {"command", "versions", "git_commit"}

@@ -19,8 +19,11 @@ from ccil_jax.config import Config
 from ccil_jax.training.progress import Display
 from experiments import benchmark, report
 from experiments.cli.command_line import UsageError
+from experiments.page import document
+from experiments.page.entries import read_entries
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.summary import Reference, aggregate_scores, scores
+from experiments.speed import tables
 
 ERRORS = {"expert_return_standard_error": 2.0, "expert_cost_standard_error": 1.5}
 
@@ -52,7 +55,7 @@ def make_run(
         "expert_length": 1000.0,
         **errors,
     }
-    run_folder.write_config(folder, Config(method=method, **config), facts)
+    run_folder.write_config(folder, Config(method=method, **{"env_steps": 30_000, **config}), facts)
     steps = np.arange(1, 6)[:, None] * np.ones((1, num_seeds))
     rows = {
         "env_steps": 6000 * steps,
@@ -116,8 +119,8 @@ class Page(html.parser.HTMLParser):
 
 
 def make_page(folders: Sequence[Path]) -> str:
-    entries = report.read_entries(folders)
-    return report.page(entries, report.draw_tasks(entries))
+    entries = read_entries(folders)
+    return document.page(entries, document.draw_tasks(entries))
 
 
 def test_page_is_self_contained_and_shows_every_seed(tmp_path: Path) -> None:
@@ -174,17 +177,17 @@ def test_levels_that_differ_between_runs_have_rows_of_their_own(tmp_path: Path) 
 
 def test_two_runs_of_one_method_are_told_apart(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "malm")]
-    assert [e.label for e in report.read_entries(folders)] == ["malm (a)", "malm (b)"]
+    assert [e.label for e in read_entries(folders)] == ["malm (a)", "malm (b)"]
     assert "All fields are equal" in make_page(folders)
 
 
 def test_folders_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folders = [make_run(tmp_path / name, "malm") for name in ("a/x/run", "b/x/run", "c/run", "d")]
     monkeypatch.chdir(folders[0])
-    entries = report.read_entries([Path(), *folders[1:]])
+    entries = read_entries([Path(), *folders[1:]])
     assert [e.label for e in entries] == [f"malm ({name})" for name in ("a/x/run", "b/x/run", "c/run", "d")]
     with pytest.raises(UsageError, match=r"RUN_DIR .*run: the same folder twice; give each run once"):
-        report.read_entries([Path(), folders[0]])
+        read_entries([Path(), folders[0]])
     assert labels.distinct_names([Path("/run"), Path("/a/run")]) == ["/run", "a/run"]
 
 
@@ -192,7 +195,7 @@ def test_folders_of_one_name_are_told_apart(tmp_path: Path, monkeypatch: pytest.
 def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
     """As a run's label, in the legend, and as a task, in the title; and on the page."""
     folders = [make_run(tmp_path / name, "malm", task=name), make_run(tmp_path / "b", "malm", task=name)]
-    entries = report.read_entries(folders)
+    entries = read_entries(folders)
     curves = [figures.Curve(name, run_folder.read_metrics(folders[0]), {}, None)]
     figure = figures.draw_panels(curves, name, ["cost_rate"])
     assert figures.png(figure).startswith(b"\x89PNG")
@@ -201,7 +204,7 @@ def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
         drawn, is_mathematics = text._preprocess_math(text.get_text())
         assert not is_mathematics
         assert drawn == expected.replace("\t", "?")
-    assert f"malm ({name}), seed 0" in " | ".join(Page(report.page(entries, {name: b""})).cells)
+    assert f"malm ({name}), seed 0" in " | ".join(Page(document.page(entries, {name: b""})).cells)
 
 
 def test_report_writes_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -283,8 +286,8 @@ def test_the_episode_shown_is_said_to_be_of_the_best_seed(tmp_path: Path, monkey
         (folder / "checkpoints").mkdir()
     calls: list[tuple[Any, ...]] = []
     monkeypatch.setattr(animation, "play_run", lambda run, *more: calls.append(more))
-    for entry in report.read_entries(folders):
-        report.animate(entry)
+    for entry in read_entries(folders):
+        document.animate(entry)
     assert calls == [
         (1, "episode-0", "One episode of malm (a/run), seed 1, which has the highest mean return of 3 seeds."),
         (0, "episode-1", "One episode of malm (b/run), seed 0."),
@@ -388,7 +391,7 @@ def test_benchmark_settings_and_table(capsys: pytest.CaptureFixture[str]) -> Non
         "meta_gradient_to_policy_step": 0.1,
         "peak_memory": 900.0,
     }
-    benchmark.print_rows([row])
+    tables.print_rows([row])
     out = capsys.readouterr().out
     for text in ("Swimmer (native)", "8 x 16", "10,000", "0.50", "0.75", "0.10", "12.0", "900"):
         assert text in out
@@ -461,6 +464,8 @@ def test_a_run_that_goes_on_is_not_reported_as_finished(tmp_path: Path, capsys: 
     with run_folder.MetricsWriter(folder) as writer:
         writer.begin({})
         writer.write(6, {**metrics, "env_steps": metrics["env_steps"] + 6000})
+    run = run_folder.read_run(folder)
+    run_folder.write_config(folder, run.config.replace(env_steps=36_000), run.facts)
     assert "continued and not finished; finish it with `train --resume`" in error_of(capsys, str(folder))
     run_folder.write_json(folder / "summary.json", {"num_seeds": 3})
     assert "summary.json: 'env_steps' is missing; the run folder is damaged" in error_of(capsys, str(folder))
@@ -468,8 +473,8 @@ def test_a_run_that_goes_on_is_not_reported_as_finished(tmp_path: Path, capsys: 
 
 def test_settings_that_a_run_does_not_use_are_shown_as_a_dash(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / method, method) for method in ("bc", "gail")]
-    entries = report.read_entries(runs)
-    page = report.page(entries, report.draw_tasks(entries))
+    entries = read_entries(runs)
+    page = document.page(entries, document.draw_tasks(entries))
     assert "<tr><td>bc_epochs</td><td>200</td><td>-</td></tr>" in page
-    assert "<tr><td>env_steps</td><td>-</td><td>3000000</td></tr>" in page
+    assert "<tr><td>env_steps</td><td>-</td><td>30000</td></tr>" in page
     assert "<td>gate</td>" not in page

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from experiments.cli.command_line import UsageError
-from experiments.runs import run_folder
+from experiments.runs import provenance, run_folder
 
 
 def metrics(num_iterations: int, first: int = 0, **more: float) -> dict[str, np.ndarray]:
@@ -76,7 +76,7 @@ def test_json_is_strict_and_whole(tmp_path: Path) -> None:
     with pytest.raises(TypeError):
         run_folder.write_json(path, {"a": object()})
     assert json.loads(path.read_text())["a"] == 0.5
-    assert run_folder.git_commit() is None or len(run_folder.git_commit() or "") >= 40
+    assert provenance.git_commit() is None or len(provenance.git_commit() or "") >= 40
 
 
 def test_a_full_disk_is_told_with_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

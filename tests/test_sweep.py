@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from ccil_jax.training import manifests, runner
 from experiments import sweep
 from experiments.cli.command_line import UsageError
 from experiments.runs import run_folder
-from experiments.sweeps import backends, variants, worker
+from experiments.sweeps import backends, machine, variants, worker
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config
 from tests.processes import command_lines, in_proc
 
@@ -39,7 +40,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "unknown key": ({"methods": ["malm"]}, "'methods': unknown; give env, method,"),
     "unknown field": ({"grid": {"gama": [0.9]}}, "--gama: unknown; did you mean --gamma?"),
     "fixed unknown field": ({"fixed": {"out": "x"}}, "--out: unknown"),
-    "unknown method": ({"method": "mallm"}, "--method 'mallm': unknown; choose one of malm"),
+    "unknown method": ({"method": "mallm"}, "--method 'mallm': unknown; did you mean malm? choose one of malm"),
     "unknown task": ({"grid": {**GRID, "env": ["Swimer"]}, "env": None}, "grid.env: also given outside of the grid"),
     "misspelt task": ({"env": "Swimer"}, "--env Swimer: unknown task; did you mean Swimmer?"),
     "empty grid": ({"grid": {}}, "grid: empty"),
@@ -301,26 +302,26 @@ def test_a_stopped_sweep_starts_nothing(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_workers_share_the_gpus_of_a_machine() -> None:
     fraction = "XLA_PYTHON_CLIENT_MEM_FRACTION"
-    assert backends.gpu_share(0, 4, [], {}) == {}
-    assert backends.gpu_share(0, 1, ["0", "1"], {}) == {}  # a worker alone has them all
-    assert [backends.gpu_share(i, 2, ["0", "7"], {}) for i in range(2)] == [
+    assert machine.gpu_share(0, 4, [], {}) == {}
+    assert machine.gpu_share(0, 1, ["0", "1"], {}) == {}  # a worker alone has them all
+    assert [machine.gpu_share(i, 2, ["0", "7"], {}) for i in range(2)] == [
         {"CUDA_VISIBLE_DEVICES": "0"},
         {"CUDA_VISIBLE_DEVICES": "7"},
     ]
-    assert [backends.gpu_share(i, 3, ["0", "1"], {}) for i in range(3)] == [
+    assert [machine.gpu_share(i, 3, ["0", "1"], {}) for i in range(3)] == [
         {"CUDA_VISIBLE_DEVICES": gpu, fraction: "0.400"} for gpu in ("0", "1", "0")
     ]
     own = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
-    assert backends.gpu_share(1, 3, ["0"], own) == {"CUDA_VISIBLE_DEVICES": "0"}
+    assert machine.gpu_share(1, 3, ["0"], own) == {"CUDA_VISIBLE_DEVICES": "0"}
 
 
 def test_gpus_are_those_that_the_user_lets_a_process_see(tmp_path: Path) -> None:
-    assert backends.visible_gpus({}, driver=tmp_path / "none") == []
+    assert machine.visible_gpus({}, driver=tmp_path / "none") == []
     for name in ("0000:01:00.0", "0000:02:00.0"):
         (tmp_path / name).mkdir()
-    assert backends.visible_gpus({}, driver=tmp_path) == ["0", "1"]
-    assert backends.visible_gpus({"CUDA_VISIBLE_DEVICES": "3,GPU-5"}, driver=tmp_path) == ["3", "GPU-5"]
-    assert backends.visible_gpus({"CUDA_VISIBLE_DEVICES": ""}, driver=tmp_path) == []
+    assert machine.visible_gpus({}, driver=tmp_path) == ["0", "1"]
+    assert machine.visible_gpus({"CUDA_VISIBLE_DEVICES": "3,GPU-5"}, driver=tmp_path) == ["3", "GPU-5"]
+    assert machine.visible_gpus({"CUDA_VISIBLE_DEVICES": ""}, driver=tmp_path) == []
 
 
 def test_settings_of_slurm_are_refused_where_slurm_is_not_used(
@@ -331,6 +332,31 @@ def test_settings_of_slurm_are_refused_where_slurm_is_not_used(
     assert end.value.code == 2
     assert "--slurm: --launcher processes does not use it; leave it out" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_row_of_the_table_is_a_launcher(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    launched = []
+
+    def launch(folders: Sequence[Path], num_workers: int, logs: Path, settings: Mapping[str, Any]) -> backends.Outcomes:
+        launched.append((len(folders), num_workers, logs, settings))
+        return ((folder, "the machine is gone") for folder in folders)
+
+    rows = {**backends.BACKENDS, "mine": backends.Backend(launch=launch, settings="whatever it takes")}
+    monkeypatch.setattr(backends, "BACKENDS", rows)
+    given = [str(write_spec(tmp_path)), "--out", str(tmp_path / "out"), "--workers", "3", "--launcher", "mine"]
+    with pytest.raises(SystemExit):
+        sweep.main([*given, "--mine", "minutes=5", "queue=fast"])
+    assert launched == [(2, 3, tmp_path / "out" / "mine", {"minutes": 5, "queue": "fast"})]
+    said = capsys.readouterr()
+    assert "FAILED (the machine is gone)" in said.out
+    assert "no variant was finished" in said.err
+    given[-1] = "ray"
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: object())
+    with pytest.raises(SystemExit):
+        sweep.main([*given, "--mine", "minutes=5"])
+    assert "--mine: --launcher ray does not use it; leave it out, or add --launcher mine" in capsys.readouterr().err
 
 
 def broken_program(folder: Path) -> Path:

@@ -12,6 +12,7 @@ from flax import struct
 from jax.sharding import NamedSharding, PartitionSpec
 
 from ccil_jax.acting import networks
+from ccil_jax.acting.networks import Policy
 from ccil_jax.acting.rollout import Actor, act, check_step
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
@@ -80,8 +81,8 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
     return trajectories
 
 
-def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool) -> Act:
-    policy = networks.policy_of(config, env)
+def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool, policy: Policy | None) -> Act:
+    policy = networks.policy_of(config, env) if policy is None else policy
 
     def policy_act(obs: jax.Array, key: jax.Array) -> jax.Array:
         shape = (*obs.shape[:-1], env.action_dim)
@@ -118,6 +119,7 @@ def evaluate(
     seed: int = 0,
     deterministic: bool = False,
     draws: Sequence[int] | None = None,
+    policy: Policy | None = None,
 ) -> Evaluation:
     """Return, cost and length of `num_episodes` new episodes of every policy in `actor`.
 
@@ -133,6 +135,7 @@ def evaluate(
         draws: one number for each policy. Policies with the same number play episodes with the same initial states,
             layouts and noise, which makes comparisons between them paired. None stands for 0 to S - 1: then the means
             of the policies are independent.
+        policy: the network that was given to `make_agent`; None for the method's own.
 
     Returns:
         NumPy arrays [S, num_episodes].
@@ -146,7 +149,7 @@ def evaluate(
 
     def run(runs: tuple[Actor, jax.Array]) -> Evaluation:
         actor, key = runs
-        return _totals(run_episodes(env, _learnt(config, env, actor, deterministic), num_episodes, key))
+        return _totals(run_episodes(env, _learnt(config, env, actor, deterministic, policy), num_episodes, key))
 
     return jax.tree.map(np.asarray, _spread(run, (actor, keys)))
 
@@ -191,6 +194,7 @@ def record(
     num_episodes: int,
     seed: int = 0,
     metadata: dict[str, Any] | None = None,
+    policy: Policy | None = None,
 ) -> Demonstrations:
     """Demonstrations of one policy, which acts stochastically.
 
@@ -201,6 +205,7 @@ def record(
         num_episodes: how many episodes to record.
         seed: of all random numbers.
         metadata: of the demonstrations.
+        policy: the network that was given to `make_agent`; None for the method's own.
 
     Returns:
         The episodes one after the other. Actions are recorded as executed: clipped to the environment's range.
@@ -208,7 +213,7 @@ def record(
 
     @jax.jit
     def run(actor: Actor, key: jax.Array) -> Trajectories:
-        return run_episodes(env, _learnt(config, env, actor, False), num_episodes, key)
+        return run_episodes(env, _learnt(config, env, actor, False, policy), num_episodes, key)
 
     steps = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
     keep = steps.valid.T  # [N, T]: one episode after the other

@@ -63,6 +63,8 @@ def make(config: Config, env: Environment, expert: ExpertData | None, **own: Any
             raise ConfigError(
                 f"{name}: makes no difference to method {config.method}; leave it out (its parts: {known})"
             )
+    if "constraint" in own and config.row.limit is None:
+        raise ConfigError(f"constraint: method {config.method} has no cost limit to keep; use ccil, or lgail")
     return kind.make(config, env, expert, **own)
 
 
@@ -105,10 +107,6 @@ def make_agent(
         DemonstrationsError: an episode of the demonstrations is longer than the environment's.
     """
     config = resolve(config, env, demonstrations)
-    if constraint is not None and config.row.limit is None:
-        raise ConfigError(
-            f"constraint: method {config.method} has no cost limit to keep; use ccil, or lgail with a limit"
-        )
     given = {
         "constraint": constraint,
         "reward_model": reward_model,

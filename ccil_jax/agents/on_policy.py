@@ -255,11 +255,11 @@ def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Bat
 
     obs = normalize(transition.obs)
     reward = parts.reward_model.reward(state.reward_model, transition)
-    chex.assert_equal_shape([reward, transition.cost])
+    chex.assert_equal_shape([reward, transition.cost], custom_message="the reward model's rewards must be [T, N]")
     signals = jnp.stack([reward, transition.cost])
     no_future = transition.terminated if config.bootstrap_at_truncation else transition.done
     value = values(obs)
-    chex.assert_shape(value, (2, *transition.cost.shape))
+    chex.assert_shape(value, (2, *transition.cost.shape), custom_message="a critic maps [..., obs_dim] to [...]")
     next_value = successor_values(
         lambda obs: values(normalize(obs)), value, transition.next_obs, no_future, transition.done
     )

@@ -20,8 +20,8 @@ from ccil_jax.learning.optimizers import adam
 from ccil_jax.methods import function_of
 from ccil_jax.types import Metrics, PyTree
 
-# Adam moves xi by about its learning rate an update, so after a long time within the limit a vanishing softplus(xi)
-# would need as long again to become felt: it stays at least this large.
+# Within the limit Adam lowers xi by about its learning rate in every update, without end. A multiplier softplus(xi)
+# that has nearly vanished would need as many updates to matter again, so it stays at least this large.
 SMALLEST_SOFTPLUS_MULTIPLIER = 1e-3
 
 
@@ -76,7 +76,16 @@ def _learn_nothing(state: PyTree, cost_gap: jax.Array, outer: Outer | None) -> t
 class Constraint(NamedTuple):
     """How the cost enters, as pure functions. By default it does not: a constraint states what differs.
 
-    `entropy_in_cost`: steps may follow the cost alone, which must then carry the entropy bonus.
+    Attributes:
+        init: the state before the first iteration.
+        multiplier: lambda of a state.
+        gate: what takes the place of the reward advantage, which the policy step ascends.
+        combine: the weights (w_r, w_c) of the natural directions x_r and x_c; the policy step moves along
+            w_r x_r + w_c x_c. `gram` holds the products of the surrogates' gradients with the directions, and so tells
+            how fast either surrogate changes along either direction.
+        update: the state after an iteration. `cost_gap` is J_k - J_E; `outer` is None for a method that holds no
+            samples out.
+        entropy_in_cost: whether a step may follow the cost alone. Then the cost's surrogate carries the entropy bonus.
     """
 
     init: Callable[[], PyTree] = _no_state
@@ -131,7 +140,7 @@ def pid(config: Config) -> Constraint:
 
 
 def trust_region_optimal(config: Config) -> Constraint:
-    """The multiplier that is optimal for this one step, in closed form (constrained policy optimisation): no memory."""
+    """The multiplier that is optimal for each single policy step, in closed form (constrained policy optimisation)."""
     return Constraint(combine=lambda multiplier, step_gap, gram: optimal_weights(gram, step_gap, config.max_kl))
 
 
@@ -254,7 +263,7 @@ def ascent(config: Config) -> Ascent:
         )
 
     def moved(state: Multiplier, parameter: jax.Array, **optimizers: PyTree) -> Multiplier:
-        # Beyond either end it would only wind up, and take as many updates to come back.
+        # A parameter beyond either end would leave lambda as it is, but need as many updates to come back (wind-up).
         parameter = jnp.clip(parameter, write(jnp.zeros(())), write(jnp.asarray(config.multiplier_max)))
         return dataclasses.replace(state, parameter=parameter, **optimizers)
 

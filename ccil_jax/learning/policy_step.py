@@ -1,6 +1,6 @@
 """The policy step of one batch, and the same step as a function of the multiplier.
 
-Joins `trust_region`, which knows gradients, to `constraints`, which know multipliers.
+It joins `trust_region`, which takes gradients of any objectives, with `constraints`, which choose their weights.
 """
 
 from collections.abc import Callable
@@ -22,20 +22,23 @@ from ccil_jax.types import Batch, Metrics, PyTree
 
 @struct.dataclass(kw_only=True)
 class PolicyStep:
-    """A policy step as a function of the multiplier: enough to replay and to differentiate it."""
+    """What is needed to carry out a policy step again under another multiplier, and to differentiate it."""
 
     policy_params: PyTree  # theta_k
     directions: Directions
-    fraction: jax.Array  # [] of the line search; 0 if it was rejected, and then the replay stands still
+    fraction: jax.Array  # [] of the full step that the line search accepted; 0 if it rejected the step
     step_gap: jax.Array  # [] J_k - J_E per step, when it was taken
     held_out: Batch  # [V]
 
 
 def random_order(config: Config, key: jax.Array) -> jax.Array:
-    """Indices [K] of a batch's samples, the V held out first. Samples are numbered simulation by simulation fastest."""
+    """Indices [K] of a batch's samples in random order, the V held-out ones first. The key is consumed.
+
+    Sample i is step i // N of simulation i % N.
+    """
     if config.held_out_unit == "transition":
         return permutation(key, config.batch_size)
-    simulations = permutation(key, config.num_envs)  # a simulation's whole stretch of the batch stays together
+    simulations = permutation(key, config.num_envs)  # all T steps of a simulation stay together
     steps = jnp.arange(config.num_steps) * config.num_envs
     return (simulations[:, None] + steps[None]).reshape(-1)
 
@@ -91,7 +94,8 @@ def improve(
         kl_tolerance=config.kl_tolerance,
         num_halvings=config.line_search_steps,
     )
-    # A rejected step replays as standing still, also where its directions were not finite (0 times NaN is NaN).
+    # Where the line search rejected the step, its replay must leave the policy as it is. Directions of 0 make sure of
+    # that also where they were not finite, because 0 times NaN is NaN.
     replayed = jax.tree.map(lambda leaf: jnp.where(fraction > 0, leaf, 0.0), directions)
     taken = PolicyStep(
         policy_params=policy_params, directions=replayed, fraction=fraction, step_gap=step_gap, held_out=held_out

@@ -142,6 +142,36 @@ def _classifier(config: Config, network: Network) -> _Classifier:
     return _Classifier(inputs, loss)
 
 
+def _descend(
+    classifier: _Classifier,
+    rule: optax.GradientTransformation,
+    expert: ExpertData,
+    state: Discriminator,
+    learner: tuple[jax.Array, jax.Array],
+    key: jax.Array,
+) -> tuple[Discriminator, Metrics]:
+    """One gradient step on a minibatch of the learner's steps, and on as many of the expert's, drawn at random."""
+    choice_key, penalty_key = jax.random.split(key)
+    learner_obs, learner_action = learner
+    indices = jax.random.randint(choice_key, (learner_obs.shape[0],), 0, expert.obs.shape[0])
+    expert_obs, expert_action = expert.obs[indices], expert.action[indices]
+    statistics = running_statistics.update(state.statistics, jnp.concatenate([learner_obs, expert_obs]))
+    expert_inputs = classifier.inputs(statistics, expert_obs, expert_action)
+    learner_inputs = classifier.inputs(statistics, learner_obs, learner_action)
+    (value, (on_expert, on_learner)), gradient = jax.value_and_grad(classifier.loss, has_aux=True)(
+        state.params, expert_inputs, learner_inputs, penalty_key
+    )
+    updates, optimizer_state = rule.update(gradient, state.optimizer, state.params)
+    new = Discriminator(
+        params=optax.apply_updates(state.params, updates), optimizer=optimizer_state, statistics=statistics
+    )
+    return new, {
+        "discriminator_loss": value,
+        "discriminator_accuracy_expert": jnp.mean(on_expert > 0),
+        "discriminator_accuracy_learner": jnp.mean(on_learner < 0),
+    }
+
+
 def discriminator(
     config: Config, network: Network, expert: ExpertData, obs_dim: int, optimizer: Optimizer = adam
 ) -> RewardModel:
@@ -153,7 +183,8 @@ def discriminator(
     rule = optimizer(config.discriminator_learning_rate)
     if config.discriminator_regularizer == "spectral_norm":
         network = spectrally_normalized(network)
-    inputs, loss = _classifier(config, network)
+    classifier = _classifier(config, network)
+    inputs = classifier.inputs
 
     def init(key: jax.Array) -> Discriminator:
         params = network.init(key)
@@ -163,29 +194,6 @@ def discriminator(
     def reward(state: Discriminator, transition: Transition) -> jax.Array:
         logits = network.apply(state.params, inputs(state.statistics, transition.obs, transition.action))
         return REWARD_FORMS[config.reward_form](logits)
-
-    def descend(
-        state: Discriminator, learner: tuple[jax.Array, jax.Array], key: jax.Array
-    ) -> tuple[Discriminator, Metrics]:
-        choice_key, penalty_key = jax.random.split(key)
-        learner_obs, learner_action = learner
-        indices = jax.random.randint(choice_key, (learner_obs.shape[0],), 0, expert.obs.shape[0])
-        expert_obs, expert_action = expert.obs[indices], expert.action[indices]
-        statistics = running_statistics.update(state.statistics, jnp.concatenate([learner_obs, expert_obs]))
-        expert_inputs = inputs(statistics, expert_obs, expert_action)
-        learner_inputs = inputs(statistics, learner_obs, learner_action)
-        (value, (on_expert, on_learner)), gradient = jax.value_and_grad(loss, has_aux=True)(
-            state.params, expert_inputs, learner_inputs, penalty_key
-        )
-        updates, optimizer_state = rule.update(gradient, state.optimizer, state.params)
-        new = Discriminator(
-            params=optax.apply_updates(state.params, updates), optimizer=optimizer_state, statistics=statistics
-        )
-        return new, {
-            "discriminator_loss": value,
-            "discriminator_accuracy_expert": jnp.mean(on_expert > 0),
-            "discriminator_accuracy_learner": jnp.mean(on_learner < 0),
-        }
 
     def update(state: Discriminator, transition: Transition, key: jax.Array) -> tuple[Discriminator, Metrics]:
         learner = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), (transition.obs, transition.action))
@@ -199,7 +207,7 @@ def discriminator(
 
         def step(state: Discriminator, minibatch: tuple[jax.Array, jax.Array]) -> tuple[Discriminator, Metrics]:
             indices, key = minibatch
-            return descend(state, jax.tree.map(lambda x: x[indices], learner), key)
+            return _descend(classifier, rule, expert, state, jax.tree.map(lambda x: x[indices], learner), key)
 
         state, metrics = scan(step, state, (indices, jax.random.split(expert_key, len(indices))))
         held_out = network.apply(state.params, inputs(state.statistics, expert.held_out_obs, expert.held_out_action))

@@ -25,12 +25,13 @@ def float64_bits(x: jax.Array) -> jax.Array:
 def _widen(bits: jax.Array) -> jax.Array:
     """binary32 bits `[...]` to binary64 words `[..., 2]` (low, high).
 
-    Integer arithmetic throughout: XLA may flush subnormal floats to zero, and has no float64 without x64.
+    This uses integer arithmetic only: XLA may turn subnormal floats into zero, and has no float64 without x64.
     """
     sign = bits & jnp.uint32(0x80000000)
     exponent = (bits >> 23) & jnp.uint32(0xFF)
     mantissa = bits & jnp.uint32(0x007FFFFF)
-    # A subnormal is normal in binary64: shift its leading one to bit 23, where the implicit one stands.
+    # A subnormal number of binary32 is a normal one in binary64: its leading 1 moves to bit 23, the place of the 1
+    # that a normal number does not store.
     shift = jnp.where(mantissa == 0, jnp.uint32(0), jax.lax.clz(mantissa) - 8)
     subnormal = (exponent == 0) & (mantissa != 0)
     mantissa = jnp.where(subnormal, (mantissa << shift) & jnp.uint32(0x007FFFFF), mantissa)

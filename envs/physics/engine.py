@@ -22,32 +22,36 @@ POST_CONSTRAINT = frozenset({"cacc", "cfrc_int", "cfrc_ext"})
 STATE = -1  # as the source of a `Copy`: the state, not a derived array
 
 _INTEGRATION = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 
 
 @dataclasses.dataclass(frozen=True)
 class Copy:
-    """One output of a call: columns of the state, or a derived array, and where they go."""
+    """Numbers that a call copies: some columns of the state or a whole derived array, and where they are written."""
 
-    source: int  # number of the derived array, or `STATE`
-    start: int  # first column, where it is the state
-    size: int
-    into_row: bool  # of the engine's own row, or of the outputs
-    target: int  # first column there
-    change: int = -1  # if not negative, what is written is the difference to the old row from this column on
+    source: int  # index of the derived array, or `STATE`
+    start: int  # the first column that is copied, if the source is the state
+    size: int  # how many numbers
+    into_row: bool  # true: written into the engine's own row; false: into the outputs
+    target: int  # the first column that is written there
+    change: int = -1  # if not negative: the old row, from this column on, is subtracted from what is written
 
 
 class Engine:
-    """Steps any number of simulations of one model; in a jitted program or, on an accelerator's host, called by it.
+    """Steps any number of simulations of one model, inside a jitted program.
+
+    On a CPU the program calls C directly. A program on an accelerator calls back to its host, which does the same.
+    Between two calls a simulation is a *row* of float64 numbers: the state, then the derived arrays that are tracked.
 
     Args:
-        model: copied.
-        num_threads: of one call.
+        model: the compiled model; it is copied.
+        num_threads: threads of one call.
         num_substeps: engine steps per call of `step`.
-        last_stage: the `mjtStage` up to which the forward pass is carried out after them; 0 for none.
-        num_state: float64 columns of a row that are the state: `mjtState` components up to the warm start.
-        row_size: float64 columns of a row, derived arrays behind the state included.
+        last_stage: after the substeps the forward pass is carried out up to this `mjtStage`; 0 for no forward pass.
+        num_state: how many columns of a row are the state: the components of `mjtState` up to the warm start.
+        row_size: columns of a row, the state and the tracked arrays together.
         output_size: columns of the outputs.
-        derived: names of `MjData` arrays.
+        derived: names of the `MjData` arrays that copies read.
         copies: what is written where; all other columns are undefined.
     """
 
@@ -66,73 +70,46 @@ class Engine:
     ) -> None:
         self._sizes = row_size, output_size
         facts = (num_threads, num_substeps, last_stage, num_state, row_size, output_size, *derived, *copies)
-        serialized = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-        mujoco.mj_saveModel(model, None, serialized)
-        digest = hashlib.sha256(repr(facts).encode() + serialized.tobytes()).digest()
-        self._key = int.from_bytes(digest[:7], "little")
+        self._key = _digest(model, facts)
         with _lock_of_engines:
             if self._key in _known:
                 return
             model = copy.copy(model)
-            names = [ctypes.create_string_buffer(name.encode()) for name in derived]
-            arrays = np.array(
-                [
-                    (ctypes.addressof(names[i]), *where, derived[i] in POST_CONSTRAINT)
-                    for i, where in enumerate(_locate(model, derived))
-                ],
-                np.int64,
-            )
-            copy_table = np.array([dataclasses.astuple(one) for one in copies], np.int64)
-            pool = np.zeros((foreign.POOL_SIZE, foreign.DERIVED + len(derived)), np.int64)
-            engine = np.zeros(foreign.ENGINE_SIZE, np.int64)
-            ctypes.CDLL(None).pthread_mutex_init(ctypes.c_void_p(engine.ctypes.data), None)
-            for field, value in {
-                foreign.MODEL: model._address,
+            located, tables = _tables_of(model, derived, copies)
+            fields = {
                 foreign.THREADS: num_threads,
                 foreign.NUM_STATE: num_state,
                 foreign.ROW: row_size,
                 foreign.OUTPUT: output_size,
-                foreign.NUM_CTRL: model.nu,
-                foreign.NUM_MOCAP: model.nmocap,
                 foreign.NUM_SUBSTEPS: num_substeps,
                 foreign.LAST_STAGE: last_stage,
-                foreign.POST: bool(POST_CONSTRAINT.intersection(derived)),
-                foreign.CTRL: _column(model, mujoco.mjtState.mjSTATE_CTRL),
-                foreign.QUAT: _column(model, mujoco.mjtState.mjSTATE_MOCAP_QUAT),
-                foreign.POS: _column(model, mujoco.mjtState.mjSTATE_MOCAP_POS),
-                foreign.NUM_DERIVED: len(derived),
-                foreign.ARRAYS: arrays.ctypes.data,
-                foreign.NUM_COPIES: len(copies),
-                foreign.COPIES: copy_table.ctypes.data,
-                foreign.POOL: pool.ctypes.data,
-                foreign.ADVANCE: foreign.advance_one.address,
-                foreign.ACC: int(mujoco.mjtStage.mjSTAGE_ACC),
-                foreign.NUM_WARNINGS: int(mujoco.mjtWarning.mjNWARNING),
-            }.items():
+                **_numbers_of(model),
+                **located,
+            }
+            engine = np.zeros(foreign.ENGINE_SIZE, np.int64)
+            ctypes.CDLL(None).pthread_mutex_init(ctypes.c_void_p(engine.ctypes.data), None)
+            for field, value in fields.items():
                 engine[field] = value
-            reasons = (
-                mujoco.mjtWarning.mjWARN_BADQPOS,
-                mujoco.mjtWarning.mjWARN_BADQVEL,
-                mujoco.mjtWarning.mjWARN_BADQACC,
-            )
-            engine[foreign.DIVERGED :] = [int(reason) for reason in reasons]
-            _enter(self._key, engine, (model, names, arrays, copy_table, pool))
+            engine[foreign.DIVERGED :] = [int(reason) for reason in _DIVERGED]
+            _enter(self._key, engine, (model, tables))
 
     def step(self, bits: jax.Array, ctrl: jax.Array, *poses: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Advances one control step; vmapped, all simulations together.
 
         Args:
-            bits: [2 row_size] uint32, the row.
+            bits: [2 row_size] uint32, the bits of the row.
             ctrl: [nu].
-            poses: none, or quaternions [4 nmocap] and positions [3 nmocap] or [num_substeps 3 nmocap].
+            poses: of the mocap bodies: nothing where there are none; otherwise the quaternions [4 nmocap], and the
+                positions [3 nmocap], or [num_substeps 3 nmocap] where they differ from substep to substep.
 
         Returns:
-            The new row's bits, and [output_size] outputs; NaN where the simulation diverged or MuJoCo raised an error.
+            The bits of the new row and the outputs [output_size]. Both are NaN where the simulation diverged or MuJoCo
+            raised an error.
         """
         return self._call(foreign.STEP, bits, ctrl, *poses)
 
     def forward(self, bits: jax.Array, ctrl: jax.Array, *poses: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The forward pass alone, as `step` else."""
+        """Carries out the forward pass alone. Arguments and results are those of `step`."""
         return self._call(foreign.FORWARD, bits, ctrl, *poses)
 
     def _call(self, name: str, bits: jax.Array, *inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -149,7 +126,7 @@ class Engine:
         return jax.pure_callback(host, shapes, *arguments, vmap_method="broadcast_all")
 
     def _on_host(self, forward: bool, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-        """What the foreign functions do, on arrays of the host."""
+        """Does what the foreign functions do, on NumPy arrays of the host."""
         old, ctrl, *poses = [np.ascontiguousarray(x) for x in arguments]
         lead, (row_size, output_size) = old.shape[:-1], self._sizes
         new = np.empty((*lead, 2 * row_size), np.uint32)
@@ -176,14 +153,64 @@ class Engine:
 
 
 _lock_of_engines = threading.Lock()
-_known: dict[int, tuple[np.ndarray, Any]] = {}  # every engine of this process, and what it points to
+_known: dict[int, tuple[np.ndarray, Any]] = {}  # every engine of this process with the objects that it points to
+
+
+def _digest(model: mujoco.MjModel, facts: Sequence[Any]) -> int:
+    """A number by which an engine is known: the same for the same model and facts, in every process."""
+    serialized = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, serialized)
+    digest = hashlib.sha256(repr(facts).encode() + serialized.tobytes()).digest()
+    return int.from_bytes(digest[:7], "little")
+
+
+def _numbers_of(model: mujoco.MjModel) -> dict[int, int]:
+    """Fields of an engine that follow from the model and from MuJoCo."""
+    return {
+        foreign.MODEL: model._address,
+        foreign.NUM_CTRL: model.nu,
+        foreign.NUM_MOCAP: model.nmocap,
+        foreign.CTRL: _column(model, mujoco.mjtState.mjSTATE_CTRL),
+        foreign.QUAT: _column(model, mujoco.mjtState.mjSTATE_MOCAP_QUAT),
+        foreign.POS: _column(model, mujoco.mjtState.mjSTATE_MOCAP_POS),
+        foreign.ADVANCE: foreign.advance_one.address,
+        foreign.ACC: int(mujoco.mjtStage.mjSTAGE_ACC),
+        foreign.NUM_WARNINGS: int(mujoco.mjtWarning.mjNWARNING),
+    }
+
+
+def _tables_of(
+    model: mujoco.MjModel, derived: Sequence[str], copies: Sequence[Copy]
+) -> tuple[dict[int, int], Sequence[Any]]:
+    """Fields of an engine that say how long its tables are and where they lie, and the tables, which must live on."""
+    names = [ctypes.create_string_buffer(name.encode()) for name in derived]
+    arrays = np.array(
+        [
+            (ctypes.addressof(names[i]), *where, derived[i] in POST_CONSTRAINT)
+            for i, where in enumerate(_locate(model, derived))
+        ],
+        np.int64,
+    )
+    copy_table = np.array([dataclasses.astuple(one) for one in copies], np.int64)
+    pool = np.zeros((foreign.POOL_SIZE, foreign.DERIVED + len(derived)), np.int64)
+    fields = {
+        foreign.POST: bool(POST_CONSTRAINT.intersection(derived)),
+        foreign.NUM_DERIVED: len(derived),
+        foreign.ARRAYS: arrays.ctypes.data,
+        foreign.NUM_COPIES: len(copies),
+        foreign.COPIES: copy_table.ctypes.data,
+        foreign.POOL: pool.ctypes.data,
+    }
+    return fields, (names, arrays, copy_table, pool)
 
 
 def _enter(key: int, engine: np.ndarray, kept: Any) -> None:
-    """Enters an engine into the table. It stays: a compiled program may outlive its environment, and has the key."""
+    """Enters an engine into the table, for good: a compiled program knows its key and may outlive the environment."""
     count = len(_known)
     if count == foreign.TABLE_SIZE:
-        raise RuntimeError(f"{foreign.TABLE_SIZE} different physics in one process; make fewer, they are kept")
+        raise RuntimeError(
+            f"more than {foreign.TABLE_SIZE} different physics in one process; make fewer, as all are kept"
+        )
     _known[key] = engine, kept
     foreign.engines[1 + 2 * count : 3 + 2 * count] = key, engine.ctypes.data
     foreign.engines[0] = count + 1
@@ -191,7 +218,7 @@ def _enter(key: int, engine: np.ndarray, kept: Any) -> None:
 
 @functools.cache
 def _register() -> None:
-    """Tells XLA of the foreign functions."""
+    """Makes the foreign functions known to XLA."""
     for name, function in ((foreign.STEP, foreign.on_step), (foreign.FORWARD, foreign.on_forward)):
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function.ctypes), platform="cpu")
 
@@ -202,14 +229,14 @@ def _column(model: mujoco.MjModel, component: mujoco.mjtState) -> int:
 
 
 def _locate(model: mujoco.MjModel, names: Sequence[str]) -> list[tuple[int, int]]:
-    """Where in C's mjData, in words of 8 bytes, the pointers to these arrays stand, and how long the arrays are.
+    """For each array: where in C's mjData the pointer to it is, counted in words of 8 bytes, and the array's length.
 
-    Found by value: the layout is not to be had from Python.
+    Python does not know the layout of that structure. So it is searched for the array's address.
     """
     data = mujoco.MjData(model)
     measure = getattr(ctypes.CDLL(None), "malloc_size" if sys.platform == "darwin" else "malloc_usable_size")
     measure.argtypes, measure.restype = [ctypes.c_void_p], ctypes.c_size_t
     words = np.ctypeslib.as_array((ctypes.c_int64 * (measure(data._address) // 8)).from_address(data._address))
     arrays = [getattr(data, name) for name in names]
-    # Empty arrays before it have the same address.
+    # Empty arrays that come before it have the same address, so the last place is the right one.
     return [(int(np.flatnonzero(words == array.ctypes.data)[-1]), array.size) for array in arrays]

@@ -1,9 +1,10 @@
-"""What XLA calls to step batches of C MuJoCo simulations: foreign functions that Numba compiles.
+"""The functions that XLA calls to step batches of C MuJoCo simulations. Numba compiles them.
 
-No Python runs between the two: a callback would hold the interpreter's lock, for which the programs of several devices
-queue, and JAX keeps no program with a callback in its compilation cache. The functions read XLA's C structures
-(`xla/ffi/api/c_api.h`, version 0.3) and call those of `mujoco/mjbatch.h` by name, so that their code is the same in
-every process. What is not, the address of an engine, stands in a table under the hash of what the engine does.
+No Python runs between XLA and MuJoCo, for two reasons: a Python callback holds the interpreter's lock, so the programs
+of several devices would wait for each other; and JAX does not store a program with a callback in its compilation cache.
+The functions read XLA's C structures (`xla/ffi/api/c_api.h`, version 0.3) and call the functions of `mujoco/mjbatch.h`
+by name, so that their code is the same in every process. The address of an engine is another one in every process. So
+programs contain a key instead, the hash of what the engine does, and a table has the address for each key.
 
 `engine.Engine` makes engines and calls these functions in a jitted program.
 """
@@ -23,19 +24,19 @@ from numba.extending import intrinsic
 
 STEP, FORWARD = "ccil_jax_mujoco_step", "ccil_jax_mujoco_forward"
 TABLE_SIZE = 4096  # engines in one process
-POOL_SIZE = 64  # batches that an engine keeps, of all sizes together: more than any machine's devices need at once
+POOL_SIZE = 64  # batches that an engine keeps, of whatever sizes: more than the devices of a machine use at a time
 NUM_REASONS = 3
 
-# Where an engine keeps what: 64 bytes for the mutex, then an int64 each.
+# The layout of an engine: 64 bytes for the mutex, then one int64 for each of these fields.
 MUTEX = 0
 MODEL, THREADS, NUM_STATE, ROW, OUTPUT, NUM_CTRL, NUM_MOCAP, NUM_SUBSTEPS, LAST_STAGE = range(8, 17)
 POST, CTRL, QUAT, POS, NUM_DERIVED, ARRAYS, NUM_COPIES, COPIES, POOL, ADVANCE = range(17, 27)
 ACC, NUM_WARNINGS, DIVERGED = range(27, 30)
 ENGINE_SIZE = DIVERGED + NUM_REASONS
-# An entry of its pool; the addresses of the derived arrays follow.
+# The fields of an entry of its pool. After them come the addresses of the derived arrays.
 NUM_SIMS, BATCH, BUSY, CONFIG, NUM_STEPS, STAGE, OWNER, DERIVED = range(8)
-# A derived array: the address of its name, where an mjData has the pointer to it (in 8 bytes), how long it is, and
-# whether the forward pass leaves it out.
+# The fields of a derived array: the address of its name, where in an mjData the pointer to it is (in words of 8
+# bytes), its length, and whether the forward pass leaves it out.
 NAME, OFFSET, LENGTH, UNKNOWN, ARRAY_SIZE = range(5)
 
 _address, _int, _nothing = types.intp, types.int32, types.void
@@ -63,9 +64,9 @@ _lock = _foreign("pthread_mutex_lock", _int, _address)
 _unlock = _foreign("pthread_mutex_unlock", _int, _address)
 _table = _foreign("ccil_jax_engines", _address)
 
-# Decorating compiles, and then the names have to be known.
+# The decorators below compile at once, so the names of the C functions have to be known by now.
 llvmlite.binding.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco.*"))))
-engines = np.zeros(1 + 2 * TABLE_SIZE, np.int64)  # how many, then key and address of each
+engines = np.zeros(1 + 2 * TABLE_SIZE, np.int64)  # how many engines there are, then key and address of each
 _address_of_engines = engines.ctypes.data
 
 
@@ -80,10 +81,10 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class _Cache(FunctionCache):
-    """Numba's files of compiled code, as a convenience: where they cannot be read or written, code is compiled anew."""
+    """Numba's cache of compiled code in files. Where these cannot be read or written, the code is compiled anew."""
 
     def load_overload(self, *args: Any) -> Any:
-        """What a file has of a function, or None."""
+        """The compiled code of a function, or None where no file has it."""
         with contextlib.suppress(OSError):
             return super().load_overload(*args)
         return None
@@ -112,7 +113,7 @@ def _called_by_c(signature: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _cast(dtype: Any) -> Any:
-    """From an address to a pointer, which is indexed like an array."""
+    """A function that turns an address into a pointer to numbers of that type, which is indexed like an array."""
 
     @intrinsic
     def cast(context: Any, address: Any) -> Any:
@@ -143,7 +144,7 @@ def _put(address: Any, index: Any, value: Any, wide: Any) -> None:
 
 @_compiled
 def _acquire(engine: Any, num_sims: Any) -> Any:
-    """A batch of that size that no other program is using, as the address of its entry; 0 if there can be none."""
+    """The address of the pool's entry for a batch of that size, reserved for the caller; 0 if none is free."""
     own = _int64s(engine)
     width = DERIVED + own[NUM_DERIVED]
     found, replaced = 0, 0
@@ -172,7 +173,7 @@ def _acquire(engine: Any, num_sims: Any) -> Any:
         fields[CONFIG] = min(own[THREADS], num_sims)  # an mjBatchConfig: the number of threads, then a zero
         fields[BATCH] = _make_batch(own[MODEL], num_sims, found + 8 * CONFIG, 0, 0)
         for i in range(own[NUM_DERIVED]):
-            # Asked for before the first call: an array is filled by later calls alone.
+            # This has to come before the first call: a call fills only the arrays that were asked for before it.
             name = _int64s(own[ARRAYS])[ARRAY_SIZE * i + NAME]
             fields[DERIVED + i] = _output(fields[BATCH], name, 0, 0)
     return found
@@ -187,7 +188,10 @@ def _release(engine: Any, entry: Any) -> None:
 
 @_called_by_c(_nothing(_address, _address, _int, _address))
 def advance_one(model: Any, data: Any, sim: Any, entry: Any) -> None:
-    """One simulation's steps and derived arrays with contact forces, on a thread of the batch: an `mjfBatchFunc`."""
+    """Steps one simulation and copies its derived arrays, contact forces included. Runs on a thread of the batch.
+
+    MuJoCo calls it: it is an `mjfBatchFunc`.
+    """
     fields = _int64s(entry)
     for _ in range(fields[NUM_STEPS]):
         _mj_step(model, data)
@@ -214,7 +218,7 @@ def _place(engine: Any, entry: Any, column: Any, values: Any, first: Any, size: 
 
 @_compiled
 def _call(engine: Any, entry: Any, forward: Any, num_steps: Any, stage: Any) -> None:
-    """Some engine steps under constant controls and poses, or none and the forward pass."""
+    """Carries out engine steps while controls and poses stay the same, or, if `forward`, the forward pass alone."""
     own, fields = _int64s(engine), _int64s(entry)
     batch, num_sims = fields[BATCH], fields[NUM_SIMS]
     if forward:
@@ -228,11 +232,11 @@ def _call(engine: Any, entry: Any, forward: Any, num_steps: Any, stage: Any) -> 
 
 @_compiled
 def _note_failures(engine: Any, entry: Any, failed: Any) -> None:
-    """Marks in `failed` [num_sims] what diverged or raised in the last call."""
+    """Marks in `failed` [num_sims] the simulations that diverged, or raised an error, in the last call."""
     own, fields = _int64s(engine), _int64s(entry)
     status, num_warnings = _int32s(_status(fields[BATCH])), own[NUM_WARNINGS]
     for i in range(fields[NUM_SIMS]):
-        warnings = _int32s(_warning(fields[BATCH]) + 8 * num_warnings * i)  # pairs: last info, count
+        warnings = _int32s(_warning(fields[BATCH]) + 8 * num_warnings * i)  # pairs of last info and count
         failed[i] |= status[i] != 0
         for j in range(NUM_REASONS):
             failed[i] |= warnings[2 * own[DIVERGED + j] + 1] != 0
@@ -288,9 +292,10 @@ def run(
     values: Any,
     wide: Any,
 ) -> None:
-    """One control step, or a forward pass, of `num_sims` simulations; arguments are addresses of their rows.
+    """One control step, or one forward pass, of `num_sims` simulations. The arrays are given by their addresses.
 
-    `num_places` says for how many engine steps `pos` has a place each: 0 without mocap bodies, 1 if they stand still.
+    `num_places` is how many positions `pos` has for each mocap body: 0 without mocap bodies, 1 if they stand still
+    during the control step, otherwise one for each engine step.
     """
     own = _int64s(engine)
     failed = np.zeros(num_sims, np.bool_)
@@ -326,7 +331,7 @@ def run(
 
 @_compiled
 def _size(buffer: Any) -> Any:
-    """Of an XLA_FFI_Buffer: the number of elements."""
+    """The number of elements of an XLA_FFI_Buffer."""
     size = 1
     for i in range(_int64s(buffer)[4]):
         size *= _int64s(_int64s(buffer)[5])[i]
@@ -335,10 +340,10 @@ def _size(buffer: Any) -> Any:
 
 @_compiled
 def _answer(frame: Any, forward: Any) -> Any:
-    """Carries out an XLA_FFI_CallFrame; the arguments are those of `Engine.__call__`. Returns 0: no error."""
+    """Carries out an XLA_FFI_CallFrame, whose arguments are those of `Engine.step`. Returns 0: no error."""
     call = _int64s(frame)
     extension = call[1]
-    if extension != 0 and _int32s(extension)[2] == 1:  # asked for the version that this is written for
+    if extension != 0 and _int32s(extension)[2] == 1:  # XLA asks for which version of its interface this is written
         metadata = _int32s(_int64s(extension)[3])
         metadata[6], metadata[7], metadata[8] = 0, 3, 0  # major, minor, traits
         return 0
@@ -375,11 +380,11 @@ def _answer(frame: Any, forward: Any) -> Any:
 
 @_called_by_c(_address(_address))
 def on_step(frame: Any) -> Any:
-    """`STEP`, as XLA calls it: one control step."""
+    """The foreign function `STEP`, which XLA calls: one control step."""
     return _answer(frame, False)
 
 
 @_called_by_c(_address(_address))
 def on_forward(frame: Any) -> Any:
-    """`FORWARD`, as XLA calls it: the forward pass alone."""
+    """The foreign function `FORWARD`, which XLA calls: the forward pass alone."""
     return _answer(frame, True)

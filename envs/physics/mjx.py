@@ -1,4 +1,4 @@
-"""MJX: MuJoCo in JAX. The default on accelerators; differentiable; `impl="warp"` is its NVIDIA-only variant."""
+"""MJX, MuJoCo in JAX: runs on accelerators, and is differentiable. `impl="warp"` is its variant for NVIDIA's GPUs."""
 
 import contextlib
 import copy
@@ -19,15 +19,16 @@ from envs.jax_tools import full_precision, usual_rules
 from envs.physics.base import Data, Mocap
 from envs.physics.mjx_patch import align_plane_capsule_frames, searches_that_end
 
-# What MJX-Warp allots, beyond which it drops contacts and says so: contacts of all simulations together (16 each for
-# 65,536; every step copies them, so fewer on a CPU, where it is for tests), and rows of constraints of each.
+# The room that MJX-Warp sets aside. Contacts that do not fit in are dropped, with a message. The contacts are those of
+# all simulations together: there are 16 for each of 65,536 simulations, and fewer on a CPU, where Warp is for tests
+# only, because every step copies them. The rows of constraints are those of each simulation.
 _WARP_CONTACTS_ON_CPU, _WARP_CONTACTS = 2**15, 2**20
 _WARP_ROWS = 512
 
 
 @struct.dataclass(kw_only=True)
 class _Carry:
-    """What MJX needs to continue. All else in its `Data` is computed anew from these by the next step."""
+    """What MJX needs to continue. The next step computes everything else in MJX's `Data` from these."""
 
     qpos: jax.Array  # [nq]
     qvel: jax.Array  # [nv]
@@ -36,12 +37,12 @@ class _Carry:
 
 
 class MjxPhysics:
-    """See `Physics`. Models without activations or actuator history.
+    """See `Physics`. For models whose actuators have no activations and no history.
 
-    The solver is the model's own, but for PGS (Humanoid), which MJX lacks: Newton takes its place and differs by
-    4e-10 in a step's velocity (median). The native backend keeps PGS, for parity with gymnasium.
+    The solver is that which the model names, except for PGS (Humanoid), which MJX lacks. There Newton takes its place,
+    and the velocity after a step differs by 4e-10 (median). The native engine keeps PGS, as gymnasium does.
 
-    Building one corrects MJX's plane-capsule contacts for the whole process; see `mjx_patch.py`.
+    Building one corrects MJX's contacts of planes and capsules for the whole process; see `mjx_patch.py`.
 
     Args:
         model: any model that MJX loads.
@@ -50,7 +51,7 @@ class MjxPhysics:
             the forward pass.
         track: `MjData` arrays for `Data.change`; in float32 unless x64 is enabled.
         refresh: whether a control step ends with a forward pass.
-        impl: "jax" or "warp". Warp is not bit-deterministic.
+        impl: "jax" or "warp". With Warp, repeating a step may give other bits.
 
     Raises:
         ImportError: impl "warp" without the package warp.
@@ -84,10 +85,10 @@ class MjxPhysics:
         forces = "cfrc_ext" in fields
         if impl == "warp":
             limits = _warp_limits(mjx.make_data(model, impl="jax"))
-            # Warp computes contact forces in every forward pass, or never.
+            # Warp computes contact forces either in every forward pass or in none.
             self._model = self._model.tree_replace({"opt._impl.run_rne_postconstraint": forces})
         self._forces_after_step = forces and impl == "jax"
-        # Strongly typed: MJX's `time` is a weak float, which would make every scan over it trace twice.
+        # All types become strong: MJX's `time` is weakly typed, and so JAX would trace every scan over it twice.
         self._template = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), mjx.make_data(model, impl=impl, **limits))
         self._num_substeps = num_substeps
         self._refresh = refresh
@@ -104,7 +105,7 @@ class MjxPhysics:
             qpos=jnp.asarray(qpos, template.qpos.dtype), qvel=jnp.asarray(qvel, template.qvel.dtype)
         )
         if self._derived:
-            # Warp's own normalises the quaternions in `qpos`; C MuJoCo leaves them.
+            # Warp's forward pass normalises the quaternions in `qpos`, but that of C MuJoCo does not change them.
             data = self._mjx.forward(self._model, data).replace(qpos=data.qpos)
         return self._pack(data, {n: jnp.zeros_like(read(data, n)) for n in self._track})
 
@@ -129,7 +130,7 @@ class MjxPhysics:
 
         def substep(state: Any, pos: jax.Array | None) -> tuple[Any, None]:
             new = self._mjx.step(self._model, state if pos is None else _place(state, pos))
-            # With x64, MJX 3.17 changes the integer types of tendon arrays: a scan's carry must keep its types.
+            # A scan's carry must keep its types, but with x64 MJX 3.17 changes the integer types of tendon arrays.
             return jax.tree.map(lambda x, like: jnp.asarray(x, like.dtype), new, state), None
 
         state, _ = jax.lax.scan(substep, state, path, length=self._num_substeps)
@@ -151,7 +152,7 @@ class MjxPhysics:
 
 
 def _warp_limits(data: Any) -> dict[str, int]:
-    """Arguments of `mjx.make_data`, from the one whose arrays have room for whatever the model can do."""
+    """Arguments of `mjx.make_data` for Warp. `data` is that of MJX-JAX, which has room for all possible constraints."""
     contacts = _WARP_CONTACTS_ON_CPU if jax.default_backend() == "cpu" else _WARP_CONTACTS
     return {"naconmax": contacts, "njmax": min(data._impl.efc_J.shape[0], _WARP_ROWS)}
 
@@ -163,14 +164,14 @@ def _place(data: Any, pos: jax.Array, quat: jax.Array | None = None) -> Any:
 
 
 def read(data: Any, name: str) -> jax.Array:
-    """An array of `mjx.Data`, from its public part or from its implementation's (where cinert, cfrc_ext are)."""
+    """An array of `mjx.Data`, from its public part or from the part of the implementation (as cinert and cfrc_ext)."""
     public = any(field.name == name for field in type(data).fields())
     array: jax.Array = getattr(data if public else data._impl, name)
     return array
 
 
 def import_mjx() -> Any:
-    """`mujoco.mjx`, without the line that its import prints where the optional package warp is missing."""
+    """Imports `mujoco.mjx`, but drops the line that it prints where the optional package warp is missing."""
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         module = importlib.import_module("mujoco.mjx")

@@ -1,12 +1,14 @@
-"""Two changes to MJX 3.17: the friction frame of plane-capsule contacts, and line searches that end.
+"""Two changes to MJX 3.17: the friction frame of plane-capsule contacts, and line searches that stop early.
 
-C MuJoCo aligns a contact's first tangent with the capsule's axis. MJX does so only where the axis's component in the
-plane exceeds 0.5 and takes the world's y axis elsewhere. The pyramidal friction cone is not isotropic, so steep legs
-slide differently: Ant's velocity error against C over one step has a 90 % quantile of 5e-2, and 1e-14 once corrected.
+The frame: C MuJoCo aligns a contact's first tangent with the capsule's axis. MJX does so only where the component of
+the axis in the plane exceeds 0.5, and elsewhere takes the world's y axis. The pyramidal friction cone is not isotropic,
+so legs that stand steeply slide differently: the error of Ant's velocity after one step, against C, has a 90 % quantile
+of 5e-2. With the correction it is 1e-14.
 
-The solver's line search is a scan over all the turns that the model allows (50), so that reverse-mode derivatives pass
-through it; those after its end change nothing. Around it, in the models here, is a while loop that lets none pass. So
-here it is a while loop too, of the few turns that some simulation needs: the same bits.
+The line search: in MJX the solver's line search is a scan over as many iterations as the model allows (50). Iterations
+after the search has ended change nothing; they are there so that reverse-mode derivatives can be taken. But the loop
+around the line search is a while loop in the models here, and that has no reverse-mode derivative anyway. So here the
+line search is a while loop too, which stops when all simulations have ended theirs. The bits are the same.
 """
 
 import contextlib
@@ -20,10 +22,11 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-_MIN_NORM = 1e-9  # of the axis's part in the plane: below it there is no direction to align with
-_TURNS = 4  # of a line search between two looks at whether it goes on
+_MIN_NORM = 1e-9  # of the axis's component in the plane; a shorter one gives no direction to align with
+_TURNS = 4  # iterations of a line search between two checks of whether it goes on
 
-_searches_end = contextvars.ContextVar("_searches_end", default=False)  # in what is being traced
+# Whether the code that is being traced now gets line searches that stop early.
+_searches_end = contextvars.ContextVar("_searches_end", default=False)
 
 
 def align_plane_capsule_frames() -> None:
@@ -50,12 +53,12 @@ def align_plane_capsule_frames() -> None:
 
 @contextlib.contextmanager
 def searches_that_end() -> Iterator[None]:
-    """While this is entered, what is traced of MJX has line searches that stop once all simulations' have ended.
+    """In this context, MJX is traced with line searches that stop when those of all simulations have ended.
 
-    Elsewhere MJX is as it was, also for other code of this process.
+    Outside of it MJX stays as it is, also for other code of this process.
 
     Raises:
-        RuntimeError: MJX's line search is not the one that this was written for.
+        RuntimeError: MJX's line search is not the one that this change was written for.
     """
     _let_searches_end()
     token = _searches_end.set(True)
@@ -79,10 +82,10 @@ def _let_searches_end() -> None:
 
 
 def _loop(condition: Callable[[Any], jax.Array], body: Callable[[Any], Any], start: Any, length: int) -> Any:
-    """The last value of a search of at most `length` turns, which its condition counts as well.
+    """The last value of a search. Its condition counts the iterations itself, so `length` is not needed.
 
-    On a GPU it is launches that take time. Packed, what is carried is one array to select and copy, not ten; and only
-    after some turns is it asked whether another is needed.
+    On a GPU most of the time goes into launching kernels. So the values are packed into one array, which is selected
+    and copied at once instead of ten; and only after every `_TURNS` iterations it is checked whether more are needed.
     """
     packed, unpack = ravel_pytree(start)
 

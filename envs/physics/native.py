@@ -1,7 +1,7 @@
-"""C MuJoCo on a thread pool, called from inside a jitted program: the fastest backend on a CPU.
+"""C MuJoCo on a thread pool, called from inside a jitted program: the fastest engine on a CPU.
 
-The engine's float64 state travels through JAX as its bits (`bits.py`), so nothing is lost between steps and nothing
-hides in the engine: a step is a function of its arguments alone, and replays of a recorded run are exact.
+JAX carries the engine's float64 state from step to step as bits (`bits.py`). So nothing is lost between steps, and the
+engine remembers nothing: a step is a function of its arguments alone, and a recorded run can be repeated exactly.
 """
 
 import os
@@ -27,18 +27,19 @@ def usable_cpus() -> int:
 
 
 class NativePhysics:
-    """See `Physics`. Each control step of a whole vmapped batch is one host call.
+    """See `Physics`. Each control step of a whole vmapped batch is one call of C.
 
-    A simulation that diverges (MuJoCo would silently put it back to the model's initial state) gets NaN qpos and qvel.
+    A simulation that diverges gets the values NaN in qpos and qvel. (MuJoCo itself would silently put it back to the
+    model's initial state.)
 
     Args:
         model: any model; the engine's own solver and integrator are used as the model says.
         num_substeps: engine steps per control step.
         fields: derived `MjData` arrays for `Data.fields`. If there are any, `init` runs the engine's forward pass.
-        track: `MjData` arrays for `Data.change`. Derived ones are compared with their value after the last control
-            step, as gymnasium does, so they are carried along in the bits.
+        track: `MjData` arrays for `Data.change`. The change of a derived array counts from its value after the last
+            control step, as in gymnasium, so this value is carried along in the bits.
         refresh: whether a control step ends with a forward pass.
-        num_threads: of one engine; None shares the usable CPUs among the local devices.
+        num_threads: threads of a call; None shares the usable CPUs among JAX's local devices.
     """
 
     name = "native"
@@ -58,8 +59,8 @@ class NativePhysics:
         self._derived = tuple(dict.fromkeys(n for n in (*fields, *track) if n not in _STATE_NAMES))
         template = mujoco.MjData(model)
         self._shapes = {n: np.shape(getattr(template, n)) for n in ("qpos", "qvel", *self._derived)}
-        # The state's components up to the warm start, and the controls right behind them: all that the next step
-        # reads beside mocap poses (no model here has applied forces).
+        # The components of the state up to the warm start. They, the controls and the mocap poses are all that the next
+        # step reads, as no model here has applied forces.
         self._num_state = mujoco.mj_stateSize(
             model,
             int(mujoco.mjtState.mjSTATE_PHYSICS | mujoco.mjtState.mjSTATE_TIME | mujoco.mjtState.mjSTATE_WARMSTART),
@@ -73,7 +74,7 @@ class NativePhysics:
         )
         self._engine = Engine(
             model,
-            # Each of JAX's CPU devices runs its own simulations, side by side with the others.
+            # JAX's CPU devices run at the same time, each with its own simulations, so they share the CPUs.
             num_threads=num_threads or max(1, usable_cpus() // jax.local_device_count()),
             num_substeps=num_substeps,
             last_stage=int(mujoco.mjtStage.mjSTAGE_ACC if refresh else mujoco.mjtStage.mjSTAGE_NONE),
@@ -122,7 +123,7 @@ class NativePhysics:
         )
 
     def _copies(self) -> list[Copy]:
-        """The engine's row is the state and the tracked arrays; then come the outputs."""
+        """What the engine writes: the tracked arrays into its row, behind the state, and then the outputs."""
         copies = []
         for name, columns in self._tracked_columns.items():
             source, size = self._derived.index(name), columns.stop - columns.start

@@ -1,6 +1,6 @@
-"""MJX-Warp's friction frames of plane-capsule contacts, corrected as in `mjx_patch.py`, and what Warp prints."""
+"""Corrects MJX-Warp's friction frames of plane-capsule contacts as `mjx_patch.py` does MJX's; makes Warp print less."""
 # mypy: ignore-errors
-# (What Warp compiles is Python by its looks only.)
+# (Warp compiles functions of its own language, which only looks like Python.)
 
 import importlib
 from typing import Any
@@ -13,13 +13,13 @@ _plane_capsule = _core.plane_capsule
 
 
 def align_plane_capsule_frames() -> None:
-    """Puts `_aligned` where MJX-Warp's kernels find their plane-capsule routine. Idempotent.
+    """Puts `_aligned` where MJX-Warp's kernels look for their plane-capsule routine. A second call changes nothing.
 
-    Warp compiles kernels at their first launch, so it must be called before any. Each capsule of this process is
-    affected, also in other code.
+    Warp compiles a kernel when it is launched for the first time, so call this before any launch. It affects all
+    capsules in this process, also those of other code.
 
     Raises:
-        RuntimeError: MJX-Warp is not the one that this correction was written for.
+        RuntimeError: MJX-Warp is not of the version that this correction was written for.
     """
     primitive: Any = importlib.import_module(f"{_WARP}.collision_primitive")
     if getattr(primitive, "plane_capsule", None) not in (_plane_capsule, _aligned):
@@ -30,7 +30,7 @@ def align_plane_capsule_frames() -> None:
 
 
 def say_less() -> None:
-    """Where nobody has chosen Warp's log level: no more lines about its set-up and each of its dozens of modules."""
+    """Stops Warp from printing a line for each of its dozens of modules, unless somebody has set its log level."""
     if wp.config.log_level == wp.LOG_INFO:
         wp.config.log_level = wp.LOG_WARNING
 

@@ -13,7 +13,7 @@ BATCH = 4096
 
 
 def make_bank(size: int, seed: int) -> np.ndarray:
-    """[size, 14, 2] float32: the first `size` attempts that place everything, in the order of their keys."""
+    """[size, 14, 2] float32: the layouts of the first `size` attempts that find a place for everything."""
     radii = keepouts(TABLE["PointButton1"])
     run = jax.jit(jax.vmap(lambda key: attempt(key, radii)))
     key, found, count = jax.random.key(seed), [], 0

@@ -21,8 +21,8 @@ from envs.safety_gym.tasks import TABLE
 from envs.safety_gym.terms import AIMS, COSTS, Situation
 
 BUTTON_PAUSE = 10  # control steps after a right press without button cost and button lidar
-CIRCLE = 0.35  # m, radius of the gremlins' course; they take 2 pi seconds for a round
-FLIGHT = 0.2  # m, height of the gremlins' targets
+CIRCLE = 0.35  # m, radius of the circles on which gremlins move; one round takes them 2 pi seconds
+FLIGHT = 0.2  # m, height of the gremlins' targets above the floor
 
 
 @struct.dataclass(kw_only=True)
@@ -30,26 +30,27 @@ class World:
     """`State.physics`: the engine's state and what the engine does not know."""
 
     data: physics_lib.Data
-    layout: jax.Array  # [P, 2] places at reset, of the robot and of every object; a goal's is kept up to date
+    layout: jax.Array  # [P, 2] m, places of the robot and of every object at reset; the goal's is the current one
     mocap_quat: jax.Array | None  # [num_mocap, 4]; None without mocap bodies (no array of size 0 can be saved)
     goal_button: jax.Array  # [] int32
     timer: jax.Array  # [] int32 control steps
-    distances: dict[str, jax.Array]  # [] each: what the next step's reward is counted from
-    ticks: jax.Array  # [] int32 engine steps since reset: the gremlins' clock
-    key: jax.Array  # of the goals to come
+    distances: dict[str, jax.Array]  # m, [] each: the next step's reward is the decrease from these
+    ticks: jax.Array  # [] int32 engine steps since reset, from which the gremlins' places follow
+    key: jax.Array  # the random key of the goals to come
 
 
 class SafetyGym:
-    """See `Environment`. As safety-gymnasium 1.0.0's level-1 tasks, observations in its order.
+    """A level-1 task of safety-gymnasium 1.0.0 as an `Environment`; observations have the original's order.
 
-    `State.terms` has the decrease of each distance of the task's aim, "bonus" (1 when it is met) and, for each of the
-    task's costs, "cost_<name>" (0 or 1). `State.cost` is 1 if any of these is.
+    `State.terms` has, by the name of each distance of the task's aim, the decrease of that distance in m; then "bonus",
+    which is 1 when the aim is met; then, for each of the task's costs, "cost_<name>", which is 0 or 1. `State.cost` is
+    1 if any of these costs is.
 
     Args:
         name: a key of `tasks.TABLE`.
-        physics: backend; see `envs.make`.
+        physics: engine; see `envs.make`.
         max_episode_steps: control steps until truncation.
-        num_threads: of the native backend; None shares the usable CPUs among the local devices.
+        num_threads: of the native engine; None shares the usable CPUs among JAX's local devices.
     """
 
     def __init__(
@@ -111,16 +112,17 @@ class SafetyGym:
         """Starts an episode in a given situation.
 
         Args:
-            layout: `[P, 2]` m, places of robot and objects, in the order of `layout.places_of`. The rows of what the
-                engine moves (robot, vases, push box) are where it started and no longer matter; the goal of a button
-                task is put on the button to press.
+            layout: `[P, 2]` m, places of robot and objects, in the order of `layout.places_of`. The rows of the robot,
+                the vases and the push box are not read, because the engine has these in `qpos`. The goal's row is not
+                read in a button task, because there the goal is on the button to press.
             qpos: `[nq]`.
             qvel: `[nv]`.
-            mocap_quat: `[num_mocap, 4]`: the gremlins' own orientations, the identity for all else and by default.
-            goal_button: `[]` int, the button to press.
-            timer: `[]` int, control steps of the pause that a right press has begun.
+            mocap_quat: `[num_mocap, 4]`, orientations of the mocap bodies: those of the gremlins' targets, and the
+                identity for all others. By default all are the identity.
+            goal_button: `[]` int, index of the button to press.
+            timer: `[]` int, control steps that are left of the pause after a right press.
             ticks: `[]` int, engine steps since the episode began.
-            key: of the goals to come; consumed. By default that of seed 0.
+            key: the random key of the goals to come; consumed. By default that of seed 0.
         """
         check_shape(f"{self.name}: layout", layout, (len(self._radii), 2))
         check_shape(f"{self.name}: qpos", qpos, (self.model.nq,))
@@ -184,7 +186,7 @@ class SafetyGym:
         return arrays | {"mocap_pos": pos, "mocap_quat": world.mocap_quat}
 
     def _advance(self, world: World, ctrl: jax.Array) -> World:
-        """The world after the engine's substeps: nothing else has changed yet."""
+        """The world after the engine's substeps. Goal and timer are still those from before."""
         mocap = None
         if world.mocap_quat is not None:
             path = self._mocap_path(world.layout, world.ticks)
@@ -193,7 +195,7 @@ class SafetyGym:
         return dataclasses.replace(world, data=data, ticks=world.ticks + scenes.SUBSTEPS)
 
     def _aim_anew(self, world: World, met: jax.Array) -> World:
-        """After the step: the pause runs on; if the aim was met, the next goal and its distances."""
+        """The world with the pause one step shorter and, if the aim was met, with the next goal and its distances."""
         key, goal_key = jax.random.split(world.key)
         timer = jnp.maximum(world.timer - 1, 0)
         goal_button = world.goal_button
@@ -210,7 +212,7 @@ class SafetyGym:
         return dataclasses.replace(world, distances=AIMS[self.task.aim].distances(self.situation(world)))
 
     def _draw_goal(self, world: World, key: jax.Array) -> jax.Array:
-        """[2]: uniform on what robot and objects, where they are now, leave free."""
+        """A goal [2], uniform on the area that is clear of the robot and the objects where they are now."""
         now = world.layout.at[0].set(self._robot_pose(world.data)[0][:2])
         for name in self.scene.free_qpos:
             now = now.at[self._places[name]].set(self._centres(world, name)[:, :2])
@@ -238,7 +240,7 @@ class SafetyGym:
         return path
 
     def _initial_poses(self, layout: jax.Array, yaws: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """qpos `[nq]` and mocap_quat `[num_mocap, 4]`: all upright, each at its place and turned by its yaw."""
+        """qpos `[nq]` and mocap_quat `[num_mocap, 4]` of bodies that stand upright at their places, turned by yaws."""
         qpos = jnp.asarray(self.model.qpos0, layout.dtype)
         if self.scene.robot.planar:
             qpos = qpos.at[:3].set(jnp.array([*layout[0], yaws[0]]))
@@ -262,14 +264,14 @@ class SafetyGym:
         return data.qpos[:3], _rotation(data.qpos[3:7])
 
     def _centres(self, world: World, name: str) -> jax.Array:
-        """[count, 3]: of a kind, wherever its places are kept."""
+        """[count, 3] m: the centres of a kind's objects, from the engine if they move freely, else from the layout."""
         if name in self.scene.free_qpos:
             return world.data.qpos[self.scene.free_qpos[name][:, None] + np.arange(3)]
         places = world.layout[self._places[name]]
         return jnp.concatenate([places, jnp.full_like(places[:, :1], self._kinds[name].height)], axis=1)
 
     def situation(self, world: World) -> Situation:
-        """Where everything is, for rewards, costs and pictures."""
+        """Where everything is: what rewards, costs and pictures are made from."""
         contacts = world.data.fields["sensordata"]
         centres = {name: self._centres(world, name) for name in self._kinds}
         return Situation(
@@ -283,7 +285,7 @@ class SafetyGym:
         )
 
     def observe(self, world: World) -> jax.Array:
-        """`[obs_dim]`: sensors, the ball's rotation, the hinges' angles, one lidar for each kind."""
+        """`[obs_dim]`: the sensors, the ball joint's rotation, the hinges' angles, then one lidar for each kind."""
         scene, qpos = self.scene, world.data.qpos
         pos, rotation = self._robot_pose(world.data)
         parts = [world.data.fields["sensordata"][: scene.num_observed]]

@@ -1,8 +1,8 @@
 """Random layouts: where robot and objects stand at the start of an episode, and where the next goal is.
 
-safety-gymnasium draws object after object uniformly from the arena until one is far enough from those before it, up to
-100 times, and starts the whole layout anew where that fails. The first valid one of that many independent candidates
-has the same distribution, and all candidates are drawn at once.
+safety-gymnasium places one object after the other. It draws places uniformly from the arena until one is far enough
+from the objects before, up to 100 times, and starts the whole layout anew where none is. Here, all 100 candidates of an
+object are drawn at once, and the first valid one is taken. The distribution is the same.
 """
 
 import functools
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from envs.safety_gym.tasks import ARENA, ROBOT_KEEPOUT, SafetyGymTask
 
 NUM_CANDIDATES = 100  # per object, as in safety-gymnasium
-NUM_GOAL_CANDIDATES = 512  # of a new goal; safety-gymnasium would go on to 10,000, and has needed 97 at most
+NUM_GOAL_CANDIDATES = 512  # for a new goal; safety-gymnasium allows 10,000, of which it has needed 97 at most
 
 
 def keepouts(task: SafetyGymTask) -> np.ndarray:
@@ -35,7 +35,7 @@ def places_of(task: SafetyGymTask) -> dict[str, slice]:
 
 
 def candidates(key: jax.Array, keepouts: ArrayLike, count: int) -> Float[Array, "... C 2"]:
-    """`count` centres for each keepout, such that all of it lies within the arena. `key` is consumed."""
+    """`count` centres for each keepout radius, such that the whole disc lies in the arena. `key` is consumed."""
     reach = ARENA - jnp.asarray(keepouts)
     return reach[..., None, None] * jax.random.uniform(key, (*reach.shape, count, 2), minval=-1.0)
 
@@ -79,7 +79,7 @@ def sample(task: SafetyGymTask, key: jax.Array) -> Float[Array, "P 2"]:
     if task.aim == "button":
         return from_bank(layout_key)
     layout, _ = attempt(layout_key, radii)
-    # The goal is drawn once more, against everything else, as it will be when it is met.
+    # The goal is drawn once more, now clear of all other objects, in the same way as each later goal.
     row = places_of(task)["goal"].start
     others = np.delete(np.arange(len(radii)), row)
     return layout.at[row].set(draw_goal(goal_key, layout[row], float(radii[row]), layout[others], radii[others]))
@@ -99,7 +99,8 @@ def from_bank(key: jax.Array) -> Float[Array, "P 2"]:
 def load_bank() -> np.ndarray:
     """[B, 14, 2] float32: valid layouts of the Button1 tasks, made by `python -m envs.safety_gym.bank`.
 
-    One attempt in 70 succeeds there, so drawing at every reset would wait for the unluckiest simulation.
+    Only one attempt in 70 succeeds for these tasks. If layouts were drawn at every reset, the whole batch would wait
+    for the simulation with the most attempts.
     """
     with resources.files("envs.safety_gym").joinpath("button_layouts.npy").open("rb") as file:
         bank: np.ndarray = np.load(file, allow_pickle=False)
@@ -109,7 +110,7 @@ def load_bank() -> np.ndarray:
 def draw_goal(
     key: jax.Array, old_goal: Float[Array, "2"], keepout: float, others: Float[Array, "P 2"], radii: np.ndarray
 ) -> Float[Array, "2"]:
-    """A goal uniform on what the others leave free; the old one should nothing be free. `key` is consumed."""
+    """A goal, uniform on the area that is clear of the others; the old goal if no candidate is. `key` is consumed."""
     points = candidates(key, keepout, NUM_GOAL_CANDIDATES)
     place, found = first_clear(points, is_clear(points, keepout, others, radii))
     return jnp.where(found, place, old_goal)

@@ -25,9 +25,9 @@ class Robot:
     planar: bool  # qpos begins with x, y, yaw; otherwise with a free joint's position and quaternion
     build: Callable[[mujoco.MjsBody, "Style"], None]  # adds joints, geoms and bodies to the root body
     actuate: Callable[[mujoco.MjSpec], None]
-    sensors: tuple[tuple[str, mujoco.mjtSensor, mujoco.mjtObj, str], ...] = ()  # beyond those of every robot
-    ball: str | None = None  # observed as a rotation matrix
-    hinges: tuple[str, ...] = ()  # observed as sine and cosine
+    sensors: tuple[tuple[str, mujoco.mjtSensor, mujoco.mjtObj, str], ...] = ()  # besides those of every robot
+    ball: str | None = None  # the ball joint whose orientation is observed, as a rotation matrix
+    hinges: tuple[str, ...] = ()  # the hinges whose angles are observed, as sine and cosine
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,8 @@ class Style:
     """How the geoms of a robot take part in contacts."""
 
     classes: Mapping[mujoco.mjtGeom, tuple[int, int]]  # contype and conaffinity of each shape; see `scene`
-    make_prism: Callable[[float, float], str] | None  # radius, half-length -> mesh, where prisms help cylinders out
+    # Of (radius, half-length): the mesh of the prism that a cylinder needs beside it; None where it needs none.
+    make_prism: Callable[[float, float], str] | None
 
 
 def _add_geom(body: mujoco.MjsBody, style: Style, type: mujoco.mjtGeom, **settings: object) -> None:
@@ -46,7 +47,10 @@ def _add_geom(body: mujoco.MjsBody, style: Style, type: mujoco.mjtGeom, **settin
 def _add_cylinder(
     body: mujoco.MjsBody, style: Style, radius: float, half_length: float, pos: list[float], density: float
 ) -> None:
-    """A cylinder along the body's x axis, if need be with the prism that meets in its place what it cannot."""
+    """A cylinder along the body's x axis.
+
+    Where the engine has no contacts of cylinders with some shapes, a prism at the same place has these contacts.
+    """
     where = {"pos": pos, "quat": [math.sqrt(0.5), 0, math.sqrt(0.5), 0]}
     _add_geom(body, style, GEOM.mjGEOM_CYLINDER, size=[radius, half_length, 0], density=density, **where)
     if style.make_prism is not None:
@@ -144,7 +148,8 @@ def _add_hinge(body: mujoco.MjsBody, name: str, axis: list[float], limits: tuple
 def _build_leg(torso: mujoco.MjsBody, leg: int, style: Style) -> None:
     s, e = _leg_signs(leg)
     capsule = {"type": GEOM.mjGEOM_CAPSULE, "size": [0.016, 0, 0], "density": 20}
-    # A body of its own, without a joint: MuJoCo's contacts depend on the inertia of the body that a geom belongs to.
+    # The shoulder has no joint, but is a body of its own as in the original: MuJoCo's contacts depend on the inertia of
+    # the body that a geom belongs to.
     shoulder = torso.add_body(name=f"shoulder_{leg}")
     _add_geom(shoulder, style, fromto=[0.05 * e, 0, 0, 0.1 * e, 0.05 * s, 0], **capsule)
     hip = shoulder.add_body(name=f"hip_{leg}", pos=[0.1 * e, 0.05 * s, 0])

@@ -1,13 +1,16 @@
-"""One compiled model per task: the robot, the floor and what can be touched. All else is analytic.
+"""One compiled model per task: the robot, the floor and the objects that can be touched. Formulas do the rest.
 
-What stands still within an episode but elsewhere in the next (buttons, pillar) is a mocap body, so that one model
-serves every layout: a mocap body acts on others through contact alone, as a fixed one does. Each gremlin is welded to
-a mocap target, which the environment leads round.
+Buttons and pillars stand still within an episode, but are elsewhere in the next. They are mocap bodies, so that one
+model serves every layout: a mocap body acts on others through contact alone, as a fixed body does. Each gremlin is
+welded to a mocap body, its target, which the environment moves in a circle.
 
-Pruned against safety-gymnasium: gremlins touch the robot alone. There, they also touch each other, buttons and the
-floor, but only while the robot shoves them (their places are 0.8 m apart and they circle in step, 0.1 m above the
-floor) and in the first steps, as they rise from it. The Point robot does not touch the floor: its sphere rests on it
-at distance 0 without vertical freedom, and there the contact never acts.
+Two kinds of contacts of safety-gymnasium are left out:
+
+* Gremlins touch the robot alone. In the original they also touch each other, buttons and the floor, but only while the
+  robot pushes them (their places are 0.8 m apart, and all circle with the same phase, 0.1 m above the floor) and in the
+  first steps, in which they rise from the floor.
+* The Point robot does not touch the floor. Its sphere lies on the floor at distance 0 and cannot move vertically, so
+  the contact would never have an effect.
 """
 
 import dataclasses
@@ -23,8 +26,9 @@ GEOM, SENSOR, OBJECT = mujoco.mjtGeom, mujoco.mjtSensor, mujoco.mjtObj
 SUBSTEPS = 10  # engine steps per control step
 PRISM_SIDES = 16
 
-# Collision classes: bits of contype. Two geoms can touch if either names the other's class in its conaffinity. A BALL
-# stands still. So does a pillar, for round things ROUND and for flat ones FLAT: on MJX these are two geoms.
+# Collision classes, as bits of contype. Two geoms can touch if one of them has the other's class in its conaffinity.
+# A BALL is a sphere that stands still. A pillar, which stands still too, is of two classes: ROUND for contacts with
+# round shapes and FLAT for contacts with flat ones, because on MJX it is two geoms.
 FLOOR, ROBOT, MOVABLE, GREMLIN, BALL, ROUND, FLAT = (1 << i for i in range(7))
 
 _BASIC_SENSORS = (
@@ -54,10 +58,12 @@ def build(task: SafetyGymTask, *, prisms: bool = False) -> Scene:
 
     Args:
         task: what it holds.
-        prisms: whether other shapes help cylinders out, for MJX, which has no cylinder against box: a prism of 16
-            sides meets boxes and other prisms. A robot's cylinders keep meeting the floor and balls. The pillar's
-            meets spheres and capsules as a capsule, the same up to 1 m, above any robot: MJX misses every second
-            contact of a capsule and a box face along it. `tests/test_mjx_shapes.py` has these pairs.
+        prisms: whether other shapes take over contacts of cylinders, as for MJX, which has no contact of a cylinder
+            with a box. Contacts with boxes and with other prisms are then those of a prism of 16 sides. A robot's
+            cylinders keep their contacts with the floor and with balls. For spheres and capsules the pillar is a
+            capsule, which has the pillar's shape up to a height of 1 m, and no robot is that high. It is no capsule
+            for boxes too, because MJX misses every second contact of a capsule with a box face that lies along it.
+            `tests/test_mjx_shapes.py` checks these pairs.
     """
     robot = ROBOTS[task.robot]
     spec = mujoco.MjSpec()
@@ -105,7 +111,7 @@ def build(task: SafetyGymTask, *, prisms: bool = False) -> Scene:
 
 
 def _mocap_name(kind: ObjectKind, index: int) -> str:
-    """The mocap body that goes with an object: its target, itself where it stands still, none where it is free."""
+    """The mocap body of an object: its target if it circles, itself if it stands still, none if it moves freely."""
     if kind.circling:
         return f"{kind.name}_{index}_target"
     return "" if kind.free or kind.shape == "none" else f"{kind.name}_{index}"
@@ -146,7 +152,7 @@ def _add_robot(spec: mujoco.MjSpec, robot: Robot, prisms: bool) -> None:
 
 
 def _add_prism(spec: mujoco.MjSpec, radius: float, half_length: float) -> str:
-    """The mesh of an upright prism with a cylinder's cross-section area; its name."""
+    """Adds the mesh of an upright prism whose cross-section has the area of the cylinder's; returns its name."""
     name = f"prism_{radius}_{half_length}"
     if name not in {mesh.name for mesh in spec.meshes}:
         angles = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
@@ -194,7 +200,7 @@ def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int, prisms: bool)
 
 
 def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> int:
-    """Every robot's and this robot's own sensors, in the order of the observation; how many they are."""
+    """Adds every robot's sensors, then this robot's own, in the order of the observation; returns how many."""
     for name, kind in _BASIC_SENSORS:
         spec.add_sensor(name=name, type=kind, objtype=OBJECT.mjOBJ_SITE, objname="robot")
     for name, kind, objtype, target in robot.sensors:

@@ -1,6 +1,6 @@
 """The eight level-1 tasks as rows of one table: a robot, the objects around it, and what is asked of it.
 
-Numbers are those of safety-gymnasium 1.0.0, in metres. A further task is a further row.
+Numbers are those of safety-gymnasium 1.0.0, in metres. A new task is a row here and a row in `envs.registry`.
 """
 
 import dataclasses
@@ -14,26 +14,26 @@ Shape = Literal["none", "box", "sphere", "cylinder", "push_box"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ObjectKind:
-    """`count` objects of a kind. Two objects' centres are at least the sum of their keepouts apart in a layout."""
+    """`count` objects of a kind. Centres of two objects of a layout are at least the sum of their keepouts apart."""
 
     name: str
     count: int = 1
     size: float  # radius, or half the side of a cube
     height: float  # of the centre
     keepout: float
-    shape: Shape = "none"  # of its collision geometry; "none" is only looked at
-    free: bool = False  # moved by contact; otherwise it stands still
+    shape: Shape = "none"  # of its collision geometry; with "none" it cannot be touched
+    free: bool = False  # whether contacts move it; otherwise it stands still
     density: float = 0.001  # kg / m^3, of a free object
-    circling: bool = False  # pulled round its place in the layout
+    circling: bool = False  # whether it is pulled in a circle around its place in the layout
 
 
 def hazards(count: int, size: float = 0.2, keepout: float = 0.18) -> ObjectKind:
-    """Discs on the floor; being over one costs."""
+    """Discs on the floor; a step costs 1 while the robot is over one."""
     return ObjectKind(name="hazards", count=count, size=size, height=0.02, keepout=keepout)
 
 
 def goal(size: float = 0.3, height: float = 0.16, keepout: float = 0.305) -> ObjectKind:
-    """Where to go, or where to push the box."""
+    """The place to go to, or to push the box to."""
     return ObjectKind(name="goal", size=size, height=height, keepout=keepout)
 
 
@@ -77,7 +77,7 @@ def _button_task(robot: str) -> SafetyGymTask:
     return SafetyGymTask(
         robot=robot,
         aim="button",
-        # The goal is a marker on the button to press; while a layout is drawn it takes a place of its own.
+        # In an episode the goal marks the button to press. But while a layout is drawn, it takes a place of its own.
         objects=(BUTTONS, goal(size=0.2, height=0.11, keepout=0.4), hazards(4), GREMLINS),
         lidars=("buttons", "goal", "hazards", "gremlins"),
         costs=("hazards", "buttons", "gremlins"),

@@ -7,27 +7,27 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-GOAL_RADIUS = 0.3  # m, within which goal and push are met
+GOAL_RADIUS = 0.3  # m; the aims "goal" and "push" are met within this distance
 
 
 @struct.dataclass(kw_only=True)
 class Situation:
-    """Where everything is after a control step, with the goal that was in force during it. Lengths in metres."""
+    """Where everything is after a control step. The goal is that which held during the step. Lengths in metres."""
 
     robot: jax.Array  # [3]
     objects: dict[str, jax.Array]  # kind -> [count, 3] centres
     sizes: dict[str, float] = struct.field(pytree_node=False)  # kind -> radius
     goal: jax.Array  # [3]
     goal_button: jax.Array  # [] index of the button to press
-    timer: jax.Array  # [] control steps for which wrong buttons still go unpunished
+    timer: jax.Array  # [] control steps during which wrong buttons still cost nothing
     touched: dict[str, jax.Array]  # kind -> [count] bool: in contact with the robot
 
 
 class Aim(NamedTuple):
-    """What a task asks for. The reward is the decrease of every distance, and 1 when it is met."""
+    """What a task asks for. The reward of a step is the sum of the decreases of all distances, plus 1 if it is met."""
 
-    distances: Callable[[Situation], dict[str, jax.Array]]  # named, [] each
-    met: Callable[[Situation], jax.Array]  # [] bool
+    distances: Callable[[Situation], dict[str, jax.Array]]  # m, by name, [] each
+    met: Callable[[Situation], jax.Array]  # [] bool: whether the goal was reached in this step
 
 
 def _distance(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -68,7 +68,7 @@ def _wrong_button(x: Situation) -> jax.Array:
     return (x.touched["buttons"] & wrong).any() & (x.timer == 0)
 
 
-# [] bool each: a step costs 1 if any of the task's holds, else 0.
+# By name, a condition [] bool. A step costs 1 if any of the task's conditions holds, else 0.
 COSTS: dict[str, Callable[[Situation], jax.Array]] = {
     "hazards": _over_hazard,
     "buttons": _wrong_button,

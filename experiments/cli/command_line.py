@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from ccil_jax.errors import UserError
 from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
 from experiments.cli import xla
+from experiments.cli.names import safe_name
 
 CONSOLE = "ccil"  # the command that an installation brings along; `experiments.cli.console` carries it out
 MAX_ERROR = 1000  # characters of an error message, which may quote a file
@@ -134,13 +135,18 @@ def boolean(text: str) -> bool:
 
 
 def default_folder(task: str, method: str, option: str = "--out") -> Path:
-    """Makes `runs/<task>_<method>_<timestamp>`, with `-02` and so on after it where another run has that name.
+    """Makes the new folder `runs/<task>_<method>_<time>`, or one with `-02`, `-03` ... after it where that is taken.
 
-    Making the folder is what keeps two runs apart that begin in the same second. So call it when everything else has
-    been checked. Raises `UsageError` that names `option` if it cannot be made.
+    Two runs that begin in the same second get different folders, because only one of them can make a folder. Call this
+    after everything else has been checked: a run that is refused should leave no folder behind.
+
+    Raises:
+        UsageError: the folder cannot be made, or no checkpoints can be kept there; the message names `option`.
     """
     stamp = datetime.datetime.now().astimezone().strftime("%Y%m%d-%H%M%S")
-    first = folder = Path("runs") / f"{task}_{method}_{stamp}"
+    first = folder = Path("runs") / f"{safe_name(task)}_{safe_name(method)}_{stamp}"
+    if complaint := unfit_for_checkpoints(first):
+        raise UsageError(f"{option} {first}: {complaint}")
     numbers = itertools.count(2)
     try:
         first.parent.mkdir(exist_ok=True)

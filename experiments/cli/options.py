@@ -14,18 +14,17 @@ from ccil_jax.presets import PRESETS
 from ccil_jax.uses import Use
 from envs import registry
 from envs.registry import PHYSICS, TASKS, TaskInfo
+from envs.task_info import physics_name
 from experiments.cli.command_line import Parser, UsageError, boolean, integer, natural, positive
 
 CONFIG_FIELDS = tuple(f.name for f in dataclasses.fields(Config))
-TASK_OPTIONS = ("cost_threshold", "contact_cost")  # some tasks have them; None leaves them to the task
-METHOD_PRESETS = {"bc": "bc", "iq_learn": "iq_learn"}  # where a method starts from one of its own
+TASK_OPTIONS = ("cost_threshold", "contact_cost", "max_episode_steps")  # of some tasks; None: the task's default
 DEFAULTS: Mapping[str, Any] = {
     "num_seeds": 3,
     "seed": 0,
     "one_by_one": False,
     "physics": "auto",
     **dict.fromkeys(TASK_OPTIONS),
-    "max_episode_steps": 1000,
     "preset": "default",
     "eval_episodes": 50,
 }
@@ -39,7 +38,7 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
         suffix = "" if default is None else f" (default: {str(default).lower()})"
         parser.add_argument("--" + name.replace("_", "-"), default=argparse.SUPPRESS, help=text + suffix, **settings)
 
-    add("env", f"task: {', '.join(TASKS)}", metavar="TASK")
+    add("env", f"task: {', '.join(TASKS)}; or package.module:function, which builds your own", metavar="TASK")
     add("num_seeds", "seeds trained side by side in one program", type=positive, metavar="S")
     add("seed", "base seed: the same seed, number of seeds and versions give the same bits", type=natural, metavar="N")
     add(
@@ -58,7 +57,7 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
         type=boolean,
         metavar="BOOL",
     )
-    add("max_episode_steps", "time limit of an episode", type=positive, metavar="T")
+    add("max_episode_steps", "time limit of an episode (default: the task's, mostly 1000)", type=positive, metavar="T")
     add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
 
 
@@ -107,9 +106,9 @@ def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] 
 
 
 def find_task(name: str | None, option: str = "--env") -> TaskInfo:
-    """The description of a task. Raises `UsageError` with the nearest name for an unknown one."""
+    """The description of a task. Raises `UsageError`, which suggests the nearest name, for an unknown one."""
     if name is None:
-        raise UsageError(f"{option}: required; one of {', '.join(TASKS)}")
+        raise UsageError(f"{option}: required; one of {', '.join(TASKS)}, or package.module:function")
     try:
         return registry.find_task(name)
     except ValueError as error:
@@ -117,14 +116,38 @@ def find_task(name: str | None, option: str = "--env") -> TaskInfo:
 
 
 def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
-    """What `envs.make` gets besides task and physics, nothing left to a default. Raises `UsageError`."""
+    """What `envs.make` gets besides the task and the physics.
+
+    Defaults are written out, so that they stay the same for a run even if those of the task change. Only a default that
+    JSON cannot hold, which a user's task may have, is left to the task.
+
+    Raises:
+        UsageError: the task has no such option, or the option cannot have that value.
+    """
     threshold = choices["cost_threshold"]
     if threshold is not None and not 0 <= threshold < float("inf"):
         raise UsageError(f"--cost-threshold {threshold}: must be finite and not negative")
+    if choices["physics"] != DEFAULTS["physics"] and not has_option(task, "physics"):
+        raise UsageError(f"--physics {choices['physics']}: {task.name} has no such option; leave it out")
     given = {name: choices[name] for name in TASK_OPTIONS if choices[name] is not None}
-    for name in given.keys() - task.options.keys():
-        raise UsageError(f"--{name.replace('_', '-')}: {task.name} has no such option; leave it out")
-    return {**task.options, **given, "max_episode_steps": choices["max_episode_steps"]}
+    for name in given:
+        if not has_option(task, name):
+            raise UsageError(f"--{name.replace('_', '-')}: {task.name} has no such option; leave it out")
+    defaults = {name: value for name, value in task.options.items() if isinstance(value, bool | int | float | str)}
+    if has_option(task, "max_episode_steps") and task.max_episode_steps is not None:
+        defaults["max_episode_steps"] = task.max_episode_steps
+    return {**defaults, **given}
+
+
+def has_option(task: TaskInfo, name: str) -> bool:
+    """Whether `envs.make` takes the option `name` for a task."""
+    return name in task.options or name in task.common
+
+
+def engine_of(task: str, env: Any) -> str:
+    """The engine that an environment of the task runs on, as --physics names it; "auto" where there is no choice."""
+    has_choice = has_option(registry.find_task(task), "physics")
+    return physics_name(env) if has_choice else str(DEFAULTS["physics"])
 
 
 def _parser_of(annotation: Any) -> Callable[[str], Any]:

@@ -11,14 +11,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs.registry import TASKS
 from experiments.page import top_down
-from experiments.policies.original_simulator import NumpyPolicy, policies
+from experiments.policies import evaluating
+from experiments.policies.numpy_policy import NumpyPolicy, policies
 from experiments.runs import figures
 from experiments.runs.run_folder import Run
 
 _STEPS_PER_FRAME = 2
-_FROM_ABOVE = frozenset({"Swimmer"})  # the others are seen from the side
 
 _SCRIPT = """
 (() => {
@@ -60,15 +59,23 @@ class Poses:
     above: bool  # the plane is the floor; otherwise it is vertical, y upwards
 
 
-def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: int = 0) -> Poses:
-    """The first `num_steps` steps of an episode, or all of a shorter one. `env` is a locomotion task."""
+def record_poses(env: Any, policy: NumpyPolicy, *, above: bool = False, num_steps: int = 300, seed: int = 0) -> Poses:
+    """The first `num_steps` steps of an episode of a locomotion task, or all steps of a shorter episode.
+
+    Args:
+        env: the task.
+        policy: that acts.
+        above: whether the bodies are seen from above; otherwise they are seen from the side.
+        num_steps: that are recorded at most.
+        seed: of the episode.
+    """
     import jax
 
     step, random = jax.jit(env.step), np.random.default_rng(seed)
     state = jax.jit(env.reset)(jax.random.key(seed))
     model, data = env.model, mujoco.MjData(env.model)
     geoms = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
-    axes = [0, 1] if env.name in _FROM_ABOVE else [0, 2]
+    axes = [0, 1] if above else [0, 2]
     frames, costs, cost, taken = [], [], False, 0
     for i in range(num_steps):
         if i % _STEPS_PER_FRAME == 0:
@@ -87,28 +94,26 @@ def record_poses(env: Any, policy: NumpyPolicy, *, num_steps: int = 300, seed: i
         costs=np.array(costs),
         num_steps=taken,
         seconds_per_frame=_STEPS_PER_FRAME * env.dt,
-        above=axes == [0, 1],
+        above=above,
     )
 
 
 def play_run(run: Run, seed: int, name: str, caption: str) -> str:
-    """The HTML of an episode of one seed of a run folder: played, or for Safety Gym one picture from above.
+    """The HTML of an episode of one seed of a run: an animation, or of a task with an arena one picture from above.
 
-    `name` is unique on the page; the caption says whose episode it is.
+    Args:
+        run: of a task that can be drawn.
+        seed: whose policy acts.
+        name: of the element; no other on the page has it.
+        caption: says whose episode it is.
     """
-    import envs
-    from ccil_jax.training import runner
-
-    env: Any = envs.make(run.facts["task"], physics=run.facts["physics"], **run.facts["env_options"])
-    loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
-    policy = policies(run.config, loaded.actor, env)[seed]
-    if TASKS[env.name].family == "safety_gym":
-        image = figures.png(top_down.draw(env, top_down.record(env, policy)))
-        caption = f"{html.escape(caption)} From dark to light as time goes by; red: a cost is paid."
-        return (
-            f"<figure>{figures.html_image(image, 'an episode from above')}<figcaption>{caption}</figcaption></figure>"
-        )
-    return to_html(record_poses(env, policy), name, caption)
+    loaded = evaluating.load(run)
+    policy = policies(loaded.config, loaded.actor, loaded.env)[seed]
+    if loaded.task.view != "arena":
+        return to_html(record_poses(loaded.env, policy, above=loaded.task.view == "above"), name, caption)
+    image = figures.png(top_down.draw(loaded.env, top_down.record(loaded.env, policy)))
+    caption = f"{html.escape(caption)} From dark to light as time goes by; red: a cost is paid."
+    return f"<figure>{figures.html_image(image, 'an episode from above')}<figcaption>{caption}</figcaption></figure>"
 
 
 def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from envs.safety_gym.environment import SafetyGym
 from envs.safety_gym.tasks import ARENA, ObjectKind
-from experiments.policies.original_simulator import NumpyPolicy
+from experiments.policies.numpy_policy import NumpyPolicy
 from experiments.runs import figures
 
 _COLORS = {

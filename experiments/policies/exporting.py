@@ -8,7 +8,7 @@ import numpy as np
 
 from ccil_jax.config import Config
 from ccil_jax.demonstrations import npz
-from experiments.policies.original_simulator import policies
+from experiments.policies.numpy_policy import policies
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 

@@ -4,23 +4,15 @@ Reward and cost follow the task's rule (`envs.locomotion`), fed with the reward 
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ccil_jax.config import Config
 from envs.registry import TASKS
+from experiments.policies.numpy_policy import NumpyPolicy, policies
 
-_LAYER = ("kernel", "bias")
-_CLIP = 5.0  # of normalised observations, as in ccil_jax.acting.running_statistics
-_MIN_STD = 1e-2
-_LOG_STD_RANGE = (-5.0, 2.0)  # of squashed policies, as in ccil_jax.acting.networks
-_ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "tanh": np.tanh,
-    "relu": lambda x: np.maximum(x, 0),
-    "swish": lambda x: x / (1 + np.exp(-x)),
-}
 _TERMS = {
     "forward": "reward_forward",
     "healthy": "reward_survive",
@@ -36,71 +28,6 @@ class Totals:
     episode_return: np.ndarray
     episode_cost: np.ndarray
     episode_length: np.ndarray
-
-
-class NumpyPolicy:
-    """The forward pass of one seed's policy; `actor` is that seed's `ccil_jax.acting.rollout.Actor` (no seed axis).
-
-    A squashed policy (IQ-Learn) maps into the range of actions [low, high]; a Gaussian one has to be clipped to it.
-    """
-
-    def __init__(self, config: Config, actor: Any, low: np.ndarray, high: np.ndarray) -> None:
-        self._squashed = "squashed" in actor.policy_params
-        layers = actor.policy_params["squashed" if self._squashed else "mean"]["params"]
-        self._layers = [
-            (np.asarray(layers[name]["kernel"], np.float64), np.asarray(layers[name]["bias"], np.float64))
-            for name in sorted(layers, key=lambda name: int(name.rsplit("_", 1)[1]))
-        ]
-        self._activation = _ACTIVATIONS[config.activation]
-        obs_dim = len(self._layers[0][0])
-        self._mean, self._std, self._clip = np.zeros(obs_dim), np.ones(obs_dim), np.inf
-        if (statistics := actor.obs_statistics) is not None:
-            count, self._clip = float(statistics.count), _CLIP
-            self._mean = np.asarray(statistics.mean, np.float64)
-            variance = np.asarray(statistics.sum_squares, np.float64) / max(count, 1.0)
-            self._std = np.maximum(np.sqrt(variance), _MIN_STD) if count > 0 else np.ones_like(variance)
-        self._center, self._half_range = (low + high) / 2, (high - low) / 2
-        if not self._squashed:
-            self._log_std = np.asarray(actor.policy_params["log_std"], np.float64)
-
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What `tests/golden/run_policy.py` computes it from where JAX cannot be installed."""
-        layers = {f"{name}_{i}": x for i, pair in enumerate(self._layers) for name, x in zip(_LAYER, pair, strict=True)}
-        if self._squashed:
-            last = {"action_center": self._center, "action_half_range": self._half_range}
-        else:
-            last = {"action_std": np.exp(self._log_std)}
-        return layers | last | {"obs_mean": self._mean, "obs_std": self._std, "obs_clip": np.asarray(self._clip)}
-
-    def mode(self, obs: np.ndarray) -> np.ndarray:
-        """[obs_dim] -> [action_dim], the action of no noise."""
-        return self._act(obs, np.zeros(len(self._center)))
-
-    def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """[obs_dim] -> [action_dim], drawn from the policy."""
-        return self._act(obs, random.standard_normal(len(self._center)))
-
-    def _act(self, obs: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        x = np.clip((obs - self._mean) / self._std, -self._clip, self._clip)
-        for kernel, bias in self._layers[:-1]:
-            x = self._activation(x @ kernel + bias)
-        kernel, bias = self._layers[-1]
-        x = x @ kernel + bias
-        if not self._squashed:
-            return x + np.exp(self._log_std) * noise
-        mean, spread = np.split(x, 2)
-        smallest, largest = _LOG_STD_RANGE
-        log_std = smallest + (largest - smallest) * (np.tanh(spread) + 1) / 2
-        return self._center + self._half_range * np.tanh(mean + np.exp(log_std) * noise)
-
-
-def policies(config: Config, actor: Any, env: Any) -> list[NumpyPolicy]:
-    """Every seed's policy; `actor` is [num_seeds]-leading."""
-    import jax
-
-    low, high = np.asarray(env.action_low, np.float64), np.asarray(env.action_high, np.float64)
-    seeds = range(len(jax.tree.leaves(actor)[0]))
-    return [NumpyPolicy(config, jax.tree.map(lambda leaf, i=i: np.asarray(leaf[i]), actor), low, high) for i in seeds]
 
 
 def evaluate(

@@ -11,7 +11,7 @@ from ccil_jax.config import Config
 from ccil_jax.training import filesystem
 from ccil_jax.training.filesystem import file_sha256
 from ccil_jax.training.progress import Display
-from experiments.cli import xla
+from experiments.cli import options, xla
 from experiments.cli.interruption import Interruption
 from experiments.runs import fault_files, run_folder, summary
 from experiments.runs.plans import ProgramPlan, RunPlan, Setup
@@ -102,7 +102,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
 def _announcement(program: ProgramPlan) -> str:
     setup, config = program.setup, program.config
     several = f"{len(program.runs)} configurations of " if len(program.runs) > 1 else ""
-    length = f"{config.bc_epochs} passes" if config.method == "bc" else f"{config.env_steps:,} steps"
+    length = f"{config.bc_epochs} passes" if not config.reads("env_steps") else f"{config.env_steps:,} steps"
     return (
         f"{config.method} on {setup.task}: {several}{setup.num_seeds} seed(s), {length} each, into "
         f"{program.checkpoint_dir.parent}"
@@ -234,7 +234,7 @@ def _facts(plan: RunPlan, env: Any) -> dict[str, Any]:
     device = jax.devices()[0]
     return {
         "task": setup.task,
-        "physics": env.physics_name,
+        "physics": options.engine_of(setup.task, env),
         "env_options": setup.env_options,
         "preset": plan.preset,
         "command": plan.command,

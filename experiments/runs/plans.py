@@ -10,7 +10,7 @@ from typing import Any
 
 from ccil_jax.config import Config, field_names, with_limit_of
 from ccil_jax.demonstrations.trajectories import Demonstrations, check_matches, check_time_limit, load_demonstrations
-from ccil_jax.methods import METHODS
+from ccil_jax.methods import METHODS, find_method
 from envs.registry import TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
@@ -94,7 +94,8 @@ def add_options(parser: Parser, *, with_method: bool = True) -> None:
     """The options of a training run, except those that say where its results go."""
     absent = argparse.SUPPRESS
     if with_method:
-        parser.add_argument("--method", default=absent, metavar="NAME", help=f"one of {', '.join(METHODS)}")
+        text = f"one of {', '.join(METHODS)}; or package.module:VARIABLE, your own"
+        parser.add_argument("--method", default=absent, metavar="NAME", help=text)
     options.add_run_options(parser)
     parser.add_argument(
         "--demos", default=absent, type=Path, metavar="FILE", help="demonstrations (default: those shipped for --env)"
@@ -129,8 +130,8 @@ def plan_of(
     """
     named = {**saved, **given}
     if "method" not in named:
-        raise UsageError(f"--method: required; one of {', '.join(METHODS)}")
-    preset = options.METHOD_PRESETS.get(named["method"], options.DEFAULTS["preset"])
+        raise UsageError(f"--method: required; one of {', '.join(METHODS)}, or package.module:VARIABLE")
+    preset = find_method(named["method"]).preset
     choices = {**options.DEFAULTS, "preset": preset, "env": None, "demos": None, "num_demos": None, **named}
     config = options.config_from(given, choices["preset"], saved)
     task = options.find_task(choices["env"])
@@ -216,7 +217,8 @@ def find_demonstrations(
         raise UsageError(f"--num-demos {count}: {path} holds {demonstrations.num_episodes}; give at most that many")
     if count is not None:
         demonstrations = demonstrations.take_episodes(count)
-    check_time_limit(demonstrations, path, env_options["max_episode_steps"])
+    if "max_episode_steps" in env_options:  # otherwise it is checked when the task has been built
+        check_time_limit(demonstrations, path, env_options["max_episode_steps"])
     return path, demonstrations
 
 

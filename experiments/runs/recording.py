@@ -9,6 +9,7 @@ from ccil_jax.demonstrations.trajectories import Demonstrations
 from experiments.cli.command_line import UsageError
 from experiments.cli.tables import number, show, with_error
 from experiments.runs import run_folder
+from experiments.runs.provenance import provenance
 from experiments.runs.run_folder import Run
 
 _SCORES = ("episode_return", "episode_cost", "episode_length")
@@ -27,9 +28,33 @@ def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int
     return max(allowed, key=lambda row: row["episode_return"])["seed"] if allowed else None
 
 
+def find_seed(run: Run, rows: Sequence[dict[str, Any]], seed_index: int | None) -> int:
+    """The seed to record: `seed_index`, or where that is None the one that `expert` would choose.
+
+    Args:
+        run: whose policies there are.
+        rows: of its seeds, from summary.json.
+        seed_index: what a person has chosen.
+
+    Raises:
+        UsageError: there is no such seed, or none keeps the limit.
+    """
+    if seed_index is None:
+        limit = cost_limit(run)
+        seed_index = choose_seed(rows, limit)
+        if seed_index is None:
+            costs = ", ".join(f"seed {row['seed']}: {row['episode_cost']:g}" for row in rows)
+            raise UsageError(
+                f"--record: no seed keeps the cost limit {limit:g} ({costs}); choose one by --seed-index N"
+            )
+    if seed_index not in [row["seed"] for row in rows]:
+        raise UsageError(f"--seed-index {seed_index}: the run has {len(rows)} seed(s); give 0 to {len(rows) - 1}")
+    return seed_index
+
+
 def read_summary(run: Run) -> dict[str, Any]:
     """What a finished run achieved. Raises `UsageError` if the run is not finished."""
-    path, config = run.folder / "summary.json", run.config
+    path = run.folder / "summary.json"
     unfinished = f"--record: the run in {run.folder} is not finished; continue it with --resume"
     if not path.is_file():
         raise UsageError(unfinished)
@@ -42,9 +67,8 @@ def read_summary(run: Run) -> dict[str, Any]:
         is_whole = False
     if not is_whole:
         raise UsageError(f"{path}: numbers are missing; repeat the evaluation with --resume")
-    given_up = all((run.folder / f"fault_seed_{row['seed']}.npz").is_file() for row in summary["per_seed"])
-    if summary["env_steps"] < config.num_iterations * config.steps_per_iteration and not given_up:
-        raise UsageError(unfinished)  # it was continued for longer, so the summary is of an older policy
+    if run_folder.was_continued(run, summary):
+        raise UsageError(unfinished)
     return summary
 
 
@@ -65,7 +89,7 @@ def facts(run: Run, summary: Mapping[str, Any], seed_index: int, command: str) -
         "evaluation": {name: row[name] for name in _SCORES},
         "random_policy": {name: summary[f"random_{name}"] for name in ("return", "cost")},
         "trained_with": {name: run.facts.get(name) for name in ("versions", "git_commit")},
-        **run_folder.provenance(),
+        **provenance(),
         "command": command,
     }
 

@@ -3,11 +3,9 @@
 import contextlib
 import csv
 import dataclasses
-import importlib.metadata
 import json
 import math
 import os
-import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,9 +18,11 @@ from ccil_jax.config import Config, check_types
 from ccil_jax.errors import ConfigError
 from ccil_jax.training.history import without_unknown
 from ccil_jax.training.versions import versions
-from envs.registry import TASKS
-from experiments.cli.command_line import UsageError, command
+from envs import registry
+from envs.registry import TASKS, TaskInfo
+from experiments.cli.command_line import UsageError
 from experiments.runs.intervals import known_mean
+from experiments.runs.provenance import git_commit
 
 METRICS = (  # order of the columns; a method leaves out those that it lacks
     "env_steps",
@@ -119,7 +119,7 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
     if unknown := sorted(set(fields) - names):
         raise UsageError(f"{path}: field '{unknown[0]}' is not known to this version; use the version that wrote it")
     task = TASKS.get(str(facts["task"]))
-    if task:  # an earlier version wrote options that make no difference to the task
+    if task:  # an earlier version wrote options that make no difference to these tasks
         known = {*task.options, "max_episode_steps"}
         facts["env_options"] = {name: value for name, value in facts["env_options"].items() if name in known}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
@@ -131,57 +131,30 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
     return Run(path.parent, config, facts)
 
 
-def git_commit() -> str | None:
-    """Commit of the sources, with `-dirty` after it where files of the checkout differ; None where it is not known."""
-    return _checkout_commit() or _built_commit() or _installed_commit()
-
-
-def _checkout_commit() -> str | None:
+def task_of(run: Run) -> TaskInfo:
+    """The task of a run. Raises `UsageError` where it is not known here, or its module cannot be imported."""
     try:
-        if _git("rev-parse", "--show-prefix") != "experiments/runs/":
-            return None  # installed inside somebody else's checkout
-        head = _git("rev-parse", "HEAD")
-        changed = _git("status", "--porcelain", "--untracked-files=no")
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return head + ("-dirty" if changed else "")
+        return registry.find_task(run.facts["task"])
+    except ValueError as error:
+        task = run.facts["task"]
+        raise UsageError(f"RUN_DIR {run.folder}: of task {task}, which is not known here ({error})") from None
 
 
-def _built_commit() -> str | None:
-    """The commit that the wheel of this installation was built from, as `hatch_build.py` wrote it down."""
-    try:
-        return (Path(__file__).parents[2] / "ccil_jax" / "COMMIT").read_text(encoding="utf-8").strip() or None
-    except OSError:
-        return None
+def was_continued(run: Run, summary: Mapping[str, Any]) -> bool:
+    """Whether a run has been continued for longer since `summary`, the content of summary.json, was written.
 
-
-def _installed_commit() -> str | None:
-    """The commit that `pip install git+URL` built this installation from (PEP 610); None for any other."""
-    try:
-        installed = importlib.metadata.distribution("ccil_jax")
-    except importlib.metadata.PackageNotFoundError:
-        return None
-    if Path(str(installed.locate_file("experiments"))).resolve() != Path(__file__).resolve().parents[1]:
-        return None  # these sources are others than the installed ones
-    origin = json.loads(installed.read_text("direct_url.json") or "{}")
-    commit = origin.get("vcs_info", {}).get("commit_id")
-    return str(commit) if commit else None
-
-
-def _git(*arguments: str) -> str:
-    command = ["git", *arguments]
-    folder = Path(__file__).parent
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
-
-
-def provenance() -> dict[str, Any]:
-    """What made a result: the command line of this process, the versions and the commit."""
-    return {"command": command(), "versions": versions(), "git_commit": git_commit()}
+    Then its policies may be newer than the summary. config.json says how long the run is to be; the summary says how
+    long it was. A run whose seeds were all given up ends earlier, and each of its seeds has left a diagnostic file.
+    """
+    if summary["env_steps"] >= run.config.num_iterations * run.config.steps_per_iteration:
+        return False
+    return not all((run.folder / f"fault_seed_{row['seed']}.npz").is_file() for row in summary["per_seed"])
 
 
 def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:
     """config.json: `facts` (task, physics, command, seeds, demonstrations, device), versions, and every field."""
-    content = {**facts, "versions": versions(), "git_commit": git_commit(), "config": dataclasses.asdict(config)}
+    made_by = {"versions": versions(), "git_commit": git_commit()}
+    content = {**facts, **made_by, "config": dataclasses.asdict(config)}
     write_json(folder / "config.json", content)
 
 

@@ -25,6 +25,7 @@ from ccil_jax.presets import PRESETS
 from ccil_jax.training import program
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
+from envs.task_info import physics_name
 from experiments.speed.turns import turn
 
 _MOST_SIMS = 1024  # of C MuJoCo, stepped for comparison
@@ -61,7 +62,7 @@ def measure_training(setting: Setting) -> dict[str, Any]:
     rate = float(np.median(rates))
     return {
         "task": setting.task,
-        "physics": env.physics_name,
+        "physics": physics_name(env),
         "training_steps_per_second": rate,
         "seconds_per_iteration": setting.num_seeds * config.steps_per_iteration / rate,
         "compile_seconds": compile_seconds,
@@ -109,7 +110,7 @@ def measure(setting: Setting) -> dict[str, Any]:
     median = {name: float(np.median(values)) for name, values in rates.items()}
     return {
         "task": setting.task,
-        "physics": env.physics_name,
+        "physics": physics_name(env),
         "method": setting.method,
         "num_seeds": setting.num_seeds,
         "num_envs": setting.num_envs,

@@ -16,6 +16,7 @@ from ccil_jax.agents.on_policy import AgentState, Parts
 from ccil_jax.learning import policy_step
 from ccil_jax.learning.policy_step import PolicyStep
 from ccil_jax.types import Batch, Transition
+from envs.task_info import physics_name
 from experiments.speed.measuring import (
     Setting,
     Work,
@@ -139,7 +140,7 @@ def profile(setting: Setting) -> dict[str, Any]:
             times[name][i] = 1e6 / rate_of(run, setting.seconds)
     return {
         "task": setting.task,
-        "physics": env.physics_name,
+        "physics": physics_name(env),
         "method": setting.method,
         "num_seeds": setting.num_seeds,
         "num_envs": setting.num_envs,

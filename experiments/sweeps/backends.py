@@ -1,10 +1,11 @@
-"""Where programs are carried out: in processes on this machine, on a Ray cluster, or by SLURM.
+"""Where the jobs of a sweep are carried out: in processes on this machine, on a Ray cluster, or by SLURM.
 
-Each place runs `experiments.sweeps.worker` on a program's folder, which all of them must see under the same path. A
-program whose worker dies is carried on once, from its last checkpoint.
+Each of these runs `experiments.sweeps.worker` on the folder of a job. All machines must see that folder under the same
+path. A job whose worker dies is started once more and goes on from its last checkpoint.
 """
 
 import concurrent.futures
+import dataclasses
 import importlib.util
 import math
 import os
@@ -13,70 +14,23 @@ import shlex
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from experiments.cli.command_line import UsageError
+from experiments.cli.subprocesses import python_path
+from experiments.sweeps import machine
 
-LAUNCHERS = ("processes", "ray", "slurm")
-_PACKAGES = {"ray": "ray", "slurm": "submitit"}  # of the launchers, which are also names of extras
-_WRONG_INPUT = 2  # exit status; a second try would end in the same way
-_TRIES = 2
-_POLL_SECONDS = 2.0  # between two looks at SLURM jobs; submitit asks SLURM itself less often
-_GPU_MEMORY = ("XLA_PYTHON_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_PYTHON_CLIENT_ALLOCATOR")
-_SHARED_GPU_MEMORY = 0.8  # of a GPU that workers share; the rest is for their CUDA contexts
-_LONGEST_JOB_MINUTES = 24 * 60  # submitit's own default is five
+_WRONG_INPUT = 2  # exit status of a worker; a second try would end in the same way
+_TRIES = 2  # of each job
+_POLL_SECONDS = 2.0  # between two looks at the state of SLURM's jobs; submitit asks SLURM itself less often
+_LONGEST_JOB_MINUTES = 24 * 60  # time limit of a SLURM job, unless the user sets it; submitit's default is 5 minutes
 
 _STOPPED = "stopped before it began"
 
-Outcomes = Iterator[tuple[Path, str | None]]  # a program's folder and, if it failed, the last words of its worker
-
-
-def usable_cpus() -> list[int]:
-    """The CPUs that this process may run on."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-
-
-def visible_gpus(environment: Mapping[str, str], driver: Path = Path("/proc/driver/nvidia/gpus")) -> list[str]:
-    """The NVIDIA GPUs that a process may use, as CUDA_VISIBLE_DEVICES names them; none without their driver."""
-    if (chosen := environment.get("CUDA_VISIBLE_DEVICES")) is not None:
-        return [name for name in chosen.split(",") if name]
-    return [str(i) for i in range(len(list(driver.iterdir())))] if driver.is_dir() else []
-
-
-def gpu_share(worker: int, num_workers: int, gpus: Sequence[str], environment: Mapping[str, str]) -> dict[str, str]:
-    """Variables that give one of several workers on this machine its GPU, and its part of that GPU's memory.
-
-    JAX takes three quarters of a GPU's memory when it starts, so a second worker on the same GPU would find none. What
-    the user says of memory has precedence.
-    """
-    if not gpus or num_workers == 1:
-        return {}
-    variables = {"CUDA_VISIBLE_DEVICES": gpus[worker % len(gpus)]}
-    sharing = math.ceil(num_workers / len(gpus))
-    if sharing > 1 and not any(name in environment for name in _GPU_MEMORY):
-        variables[_GPU_MEMORY[0]] = f"{_SHARED_GPU_MEMORY / sharing:.3f}"
-    return variables
-
-
-def check_launcher(launcher: str) -> None:
-    """Raises `UsageError` where the launcher's package is not installed."""
-    package = _PACKAGES.get(launcher)
-    if package and importlib.util.find_spec(package) is None:
-        raise UsageError(f"--launcher {launcher}: {package} is not installed; pip install 'ccil_jax[{launcher}]'")
-
-
-def launch(
-    launcher: str, folders: Sequence[Path], num_workers: int, log_folder: Path, settings: Mapping[str, Any]
-) -> Outcomes:
-    """Carries out the programs in `folders`, `num_workers` at a time, and yields them as they end."""
-    if launcher == "ray":
-        return on_ray(folders, num_workers)
-    if launcher == "slurm":
-        return on_slurm(folders, num_workers, log_folder, settings)
-    return in_processes(folders, num_workers)
+Outcomes = Iterator[tuple[Path, str | None]]  # folder of a job that ended; if it failed, the last line of its output
 
 
 def run_worker(
@@ -85,10 +39,16 @@ def run_worker(
     stopping: threading.Event | None = None,
     variables: Mapping[str, str] = MappingProxyType({}),
 ) -> str | None:
-    """Carries out the program in `folder` in a process of its own, and once more if that dies.
+    """Carries out the job in `folder` in a process of its own, and starts another one if that process dies.
 
-    Returns the last words of a worker that failed for good. `stopping` ends it, and starts none once it is set.
-    `variables` are of its environment.
+    Args:
+        folder: of the job.
+        cpus: that the process may use; none stands for all.
+        stopping: once it is set, the process is ended and no other is started.
+        variables: of the environment, besides those of this process.
+
+    Returns:
+        None if the job is done; otherwise the exit status and the last line of the worker's output.
     """
     stopping = stopping or threading.Event()
     command = [sys.executable, "-P", "-m", "experiments.sweeps.worker", str(folder), "--until-eof"]
@@ -101,8 +61,8 @@ def run_worker(
             log.open("ab") as output,
             subprocess.Popen(
                 command,
-                stdin=subprocess.PIPE,  # it ends with this process, whose end closes the pipe,
-                start_new_session=True,  # and not by a Ctrl-C, after which it would be tried again
+                stdin=subprocess.PIPE,  # closes when this process ends, which ends the worker
+                start_new_session=True,  # so that Ctrl-C reaches this process only, which then ends the worker
                 stdout=output,
                 stderr=output,
                 env={**os.environ, **variables, "PYTHONPATH": python_path()},
@@ -119,12 +79,12 @@ def run_worker(
 
 
 def in_processes(folders: Sequence[Path], num_workers: int) -> Outcomes:
-    """Worker processes on this machine; each gets its share of the CPUs."""
-    cpus, gpus = usable_cpus(), visible_gpus(os.environ)
+    """Carries out jobs in processes on this machine; each process gets its share of the CPUs and GPUs."""
+    cpus, gpus = machine.usable_cpus(), machine.visible_gpus(os.environ)
     num_workers = max(1, min(num_workers, len(folders), len(cpus)))
     shares: queue.SimpleQueue[tuple[list[int], dict[str, str]]] = queue.SimpleQueue()
     for i in range(num_workers):
-        shares.put((cpus[i::num_workers], gpu_share(i, num_workers, gpus, os.environ)))
+        shares.put((cpus[i::num_workers], machine.gpu_share(i, num_workers, gpus, os.environ)))
     stopping = threading.Event()
 
     def carry_out(folder: Path) -> str | None:
@@ -140,25 +100,26 @@ def in_processes(folders: Sequence[Path], num_workers: int) -> Outcomes:
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         finally:
-            for future in futures:  # those that have not begun, before the pool takes them for free hands
+            for future in futures:  # at first those that have not begun, so that no free thread begins one of them
                 future.cancel()
             stopping.set()
 
 
 def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
-    """Tasks of a Ray cluster: the one that RAY_ADDRESS names, else one on this machine."""
+    """Carries out jobs as tasks of the Ray cluster that RAY_ADDRESS names, or else of one on this machine."""
     import ray
 
     ray.init(runtime_env={"env_vars": {"PYTHONPATH": python_path()}}, log_to_driver=False)
     try:
         cpus = [int(node["Resources"].get("CPU", 0)) for node in ray.nodes() if node["Alive"]]
-        share = max(1, min(max(cpus), sum(cpus) // num_workers))  # a task that no node can hold would wait for ever
-        # Ray, too, starts a task once more whose process dies: the machine may be gone.
+        # No task may ask for more CPUs than a single machine has: Ray would wait for such a machine for ever.
+        share = max(1, min(max(cpus), sum(cpus) // num_workers))
         gpus = sum(node["Resources"].get("GPU", 0) for node in ray.nodes() if node["Alive"])
-        # Without a share of the GPUs Ray hides them from a task; parts of one are shared, and so is its memory.
+        # Ray hides the GPUs from a task that asks for none. Tasks that ask for less than one GPU share its memory.
         gpu = min(1.0, math.floor(1000 * gpus / num_workers) / 1000)
-        shared = 0 < gpu < 1 and not any(name in os.environ for name in _GPU_MEMORY)
-        variables = {_GPU_MEMORY[0]: f"{_SHARED_GPU_MEMORY * gpu:.3f}"} if shared else {}
+        shared = 0 < gpu < 1 and not any(name in os.environ for name in machine.GPU_MEMORY)
+        variables = {machine.GPU_MEMORY[0]: f"{machine.SHARED_GPU_MEMORY * gpu:.3f}"} if shared else {}
+        # If the machine of a task is lost, Ray starts the task once more on another one.
         task = ray.remote(num_cpus=share, num_gpus=gpu, max_retries=_TRIES - 1)(run_worker)
         waiting = {task.remote(folder, variables=variables): folder for folder in folders}
         while waiting:
@@ -173,17 +134,21 @@ def on_ray(folders: Sequence[Path], num_workers: int) -> Outcomes:
 
 
 def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settings: Mapping[str, Any]) -> Outcomes:
-    """An array of SLURM jobs through submitit, which runs them on this machine where there is no SLURM.
+    """Carries out jobs as an array of SLURM jobs, by submitit, which runs them on this machine where there is no SLURM.
 
-    That a job was lost is known from SLURM's accounting (`sacct`). When nobody waits for them any longer, jobs are
-    cancelled.
+    SLURM's accounting (`sacct`) tells that a job was lost; it is then submitted once more. If this process stops
+    waiting, the jobs that have not ended are cancelled.
 
-    `settings` are parameters of `submitit.AutoExecutor`, such as timeout_min or slurm_partition.
+    Args:
+        folders: of the jobs.
+        num_workers: so many SLURM jobs run at a time.
+        log_folder: for the output of the SLURM jobs.
+        settings: parameters of `submitit.AutoExecutor`, such as timeout_min or slurm_partition.
     """
     import submitit
 
     executor = submitit.AutoExecutor(folder=log_folder)
-    # A job's Python is not to look for our packages in the folder that it is submitted from.
+    # With PYTHONSAFEPATH a job's Python does not look for our packages in the folder that it was submitted from.
     setup = [f"export PYTHONSAFEPATH=1 PYTHONPATH={shlex.quote(python_path())}"]
     defaults = {
         "slurm_setup": setup,
@@ -195,7 +160,7 @@ def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settin
     folder_of = dict(zip(executor.map_array(run_worker, folders), folders, strict=True))
     jobs, running, lost = list(folder_of), set(folder_of), set()
     try:
-        for job in submitit.helpers.as_completed(jobs, poll_frequency=_POLL_SECONDS):  # of `jobs` as it grows
+        for job in submitit.helpers.as_completed(jobs, poll_frequency=_POLL_SECONDS):  # which sees replacements too
             running.remove(job)
             folder, failure = folder_of[job], None
             try:
@@ -215,11 +180,49 @@ def on_slurm(folders: Sequence[Path], num_workers: int, log_folder: Path, settin
             job.cancel(check=False)
 
 
-def python_path() -> str:
-    """PYTHONPATH of a worker, which imports the packages that this process did."""
-    return os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-
-
 def _last_line(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else "no output"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Backend:
+    """One row of the table: a place where jobs are carried out."""
+
+    # Carries out the jobs in `folders`, `num_workers` at a time, and yields them as they end. Logs of its own go into
+    # the folder `logs`; `settings` are those of the option that is described below.
+    launch: Callable[[Sequence[Path], int, Path, Mapping[str, Any]], Outcomes]
+    package: str | None = None  # that has to be installed
+    install: str = ""  # what pip has to install for it
+    settings: str | None = None  # help of an option with the row's name that takes settings; None: there are none
+
+
+# By the name that --launcher takes. Another row here makes another launcher.
+BACKENDS: Mapping[str, Backend] = {
+    "processes": Backend(launch=lambda folders, num_workers, logs, settings: in_processes(folders, num_workers)),
+    "ray": Backend(
+        launch=lambda folders, num_workers, logs, settings: on_ray(folders, num_workers),
+        package="ray",
+        install="ccil_jax[ray]",
+    ),
+    "slurm": Backend(
+        launch=lambda folders, num_workers, logs, settings: on_slurm(folders, num_workers, logs, settings),
+        package="submitit",
+        install="ccil_jax[slurm]",
+        settings="parameters of submitit's executor, such as cpus_per_task=8 timeout_min=600 slurm_partition=cpu",
+    ),
+}
+
+
+def check_launcher(name: str) -> None:
+    """Raises `UsageError` where the package that a launcher needs is not installed."""
+    backend = BACKENDS[name]
+    if backend.package and importlib.util.find_spec(backend.package) is None:
+        raise UsageError(f"--launcher {name}: {backend.package} is not installed; pip install '{backend.install}'")
+
+
+def check_settings(launcher: str, given: Mapping[str, Any]) -> None:
+    """Raises `UsageError` where settings were `given`, by the launcher that they are of, but another is used."""
+    for name, settings in given.items():
+        if settings and name != launcher:
+            raise UsageError(f"--{name}: --launcher {launcher} does not use it; leave it out, or add --launcher {name}")

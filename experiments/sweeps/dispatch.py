@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.training.versions import versions
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
-from experiments.sweeps import backends, variants
+from experiments.runs.provenance import provenance
+from experiments.sweeps import backends, machine, variants
 from experiments.sweeps.variants import Job, Variant
 
 _INTERRUPTED = 130  # exit status after Ctrl-C, as of shells
@@ -19,7 +19,7 @@ _INTERRUPTED = 130  # exit status after Ctrl-C, as of shells
 
 def add_options(parser: Parser) -> None:
     """Where and how programs are carried out, and where the results go."""
-    default = max(1, len(backends.usable_cpus()) // 2)
+    default = max(1, len(machine.usable_cpus()) // 2)
     parser.add_argument(
         "--workers",
         type=command_line.positive,
@@ -27,17 +27,30 @@ def add_options(parser: Parser) -> None:
         metavar="N",
         help=f"programs at a time; those of one machine share its CPUs (default: one for two CPUs, {default} here)",
     )
-    parser.add_argument("--launcher", choices=backends.LAUNCHERS, default="processes", help="who carries programs out")
     parser.add_argument(
-        "--slurm",
-        nargs="+",
-        type=_setting,
-        default=[],
-        metavar="NAME=VALUE",
-        help="parameters of submitit's executor, such as cpus_per_task=8 timeout_min=600 slurm_partition=cpu",
+        "--launcher", choices=tuple(backends.BACKENDS), default="processes", help="who carries programs out"
     )
+    for name, backend in backends.BACKENDS.items():
+        if backend.settings:
+            parser.add_argument(
+                f"--{name}", nargs="+", type=_setting, default=[], metavar="NAME=VALUE", help=backend.settings
+            )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for runs, table and figure")
     parser.add_argument("--resume", action="store_true", help="finish what is missing in --out")
+
+
+def option_names() -> tuple[str, ...]:
+    """Names of the options that `add_options` adds, as attributes of the parsed arguments."""
+    return ("workers", "launcher", "out", "resume", *_with_settings())
+
+
+def _with_settings() -> list[str]:
+    return [name for name, backend in backends.BACKENDS.items() if backend.settings]
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """The settings given, by the launcher that they are of."""
+    return {name: dict(getattr(arguments, name)) for name in _with_settings()}
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -61,10 +74,7 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
     """
     out: Path = arguments.out
     backends.check_launcher(arguments.launcher)
-    if arguments.slurm and arguments.launcher != "slurm":
-        raise UsageError(
-            f"--slurm: --launcher {arguments.launcher} does not use it; leave it out, or add --launcher slurm"
-        )
+    backends.check_settings(arguments.launcher, _settings(arguments))
     command_line.check_output_folder(out, resume=arguments.resume, record=record)
     if arguments.resume:
         _check_choices(out / record, choices)
@@ -76,8 +86,7 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
     num_runs = sum(variant.plan.setup.num_seeds for variant in chosen)
     done = f", {len(jobs)} of them unfinished" if arguments.resume else ""
     print(f"{len(chosen)} variants, {num_runs} runs, in {len(all_jobs)} programs{done}", flush=True)
-    facts = {"command": command_line.command(), "versions": versions()}
-    run_folder.write_json(out / record, {**facts, "git_commit": run_folder.git_commit(), "choices": choices})
+    run_folder.write_json(out / record, {**provenance(), "choices": choices})
     for job in jobs:
         variants.write_job(job)
     return _wait(jobs, arguments)
@@ -95,9 +104,9 @@ def _check_choices(path: Path, choices: Mapping[str, Any]) -> None:
 def _wait(jobs: Sequence[Job], arguments: argparse.Namespace) -> int:
     start, num_failed = time.monotonic(), 0
     by_folder = {job.folder: job for job in jobs}
-    outcomes = backends.launch(
-        arguments.launcher, list(by_folder), arguments.workers, arguments.out / "slurm", dict(arguments.slurm)
-    )
+    launcher = arguments.launcher
+    settings, logs = _settings(arguments).get(launcher, {}), arguments.out / launcher
+    outcomes = backends.BACKENDS[launcher].launch(list(by_folder), arguments.workers, logs, settings)
     try:
         for i, (folder, failure) in enumerate(outcomes, 1):
             names = " ".join(variant.name for variant in by_folder[folder].variants)

@@ -18,6 +18,7 @@ from ccil_jax.config import relevant
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
 from ccil_jax.training.filesystem import file_sha256
 from experiments.cli.command_line import Parser, UsageError
+from experiments.cli.names import safe_name
 from experiments.runs import plans, run_folder
 from experiments.runs.plans import RunPlan, static_values
 
@@ -126,7 +127,7 @@ def _job(variants: Sequence[Variant], out: Path) -> Job:
     # the checkpoints of this one.
     digest = hashlib.sha256(json.dumps([[v.name, v.options] for v in variants]).encode()).hexdigest()[:10]
     ((task, method),) = {(v.plan.setup.task, v.plan.config.method) for v in variants}
-    return Job(folder=out / "programs" / f"{task}_{method}_{digest}", variants=tuple(variants))
+    return Job(folder=out / "programs" / f"{safe_name(task)}_{safe_name(method)}_{digest}", variants=tuple(variants))
 
 
 def write_job(job: Job) -> None:

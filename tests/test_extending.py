@@ -1,0 +1,189 @@
+"""`docs/extending.md` from outside the package: its Python blocks in order, in a folder of their own."""
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import ccil_jax
+import envs
+from ccil_jax.config import validate
+from ccil_jax.demonstrations import formats
+from ccil_jax.errors import ConfigError
+from ccil_jax.methods import Method, _methods
+from envs import registry
+from envs.testing import check_environment
+from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
+
+PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """What the page's program has defined. Its registrations are undone afterwards."""
+    blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    namespace: dict[str, Any] = {"__name__": "extending"}
+    kept = {name: dict(table) for name, table in (("tasks", registry._tasks), ("methods", _methods))}
+    with pytest.MonkeyPatch.context() as patched, quick_compilation():
+        patched.chdir(tmp_path_factory.mktemp("page"))
+        for block in blocks:
+            exec(compile(block, str(PAGE), "exec"), namespace)  # noqa: S102  (the page is ours)
+        yield namespace
+    registry._tasks.clear()
+    registry._tasks.update(kept["tasks"])
+    _methods.clear()
+    _methods.update(kept["methods"])
+    formats._formats.pop("csv")
+
+
+def test_the_tasks_keep_their_promises(names: dict[str, Any]) -> None:
+    check_environment(names["env"])
+    check_environment(names["careful"])
+    assert envs.TASKS["Cart"].cost_limit == 5.0
+
+
+def test_the_page_trains_its_own_method(names: dict[str, Any]) -> None:
+    """Its rule, lambda = max(0, s) with s <- 0.9 s + rate (J_k - J_E), reward, and network."""
+    result = names["result"]
+    assert result.config.cost_limit == names["demonstrations"].mean_episode_cost
+    total = np.full(2, result.config.initial_multiplier)
+    for cost, multiplier in zip(result.metrics["episode_cost"], result.metrics["multiplier"], strict=True):
+        gap = np.where(np.isnan(cost), 0.0, cost - result.config.cost_limit)  # J_k starts at the limit
+        total = 0.9 * total + result.config.multiplier_learning_rate * gap
+        np.testing.assert_allclose(multiplier, np.maximum(total, 0.0), rtol=1e-4, atol=1e-6)
+    assert (result.metrics["imitation_reward"] > 0).all()
+    assert (result.metrics["imitation_reward"] <= 1).all()
+    assert result.actor.policy_params["weights"].shape == (2, 2, 1)
+    assert names["found"].episode_return.shape == (2, 4)
+
+
+def test_a_rule_from_outside_is_that_of_the_package_where_both_say_the_same() -> None:
+    """Projected dual ascent, lambda <- min(max(lambda + rate (J_k - J_E), 0), max), written down once more."""
+    config = walk_config(method="ccil", multiplier_update="sgd", multiplier_max=0.3)
+
+    def update(multiplier: Any, cost_gap: Any, outer: Any) -> tuple[Any, dict[str, Any]]:
+        return jnp.clip(multiplier + config.multiplier_learning_rate * cost_gap, 0.0, config.multiplier_max), {}
+
+    own = ccil_jax.Constraint(
+        init=lambda: jnp.asarray(config.initial_multiplier),
+        multiplier=lambda multiplier: multiplier,
+        combine=lambda multiplier, step_gap, gram: jnp.stack([jnp.ones(()), -multiplier]),
+        update=update,
+    )
+
+    def trained(constraint: ccil_jax.Constraint | None) -> Any:
+        agent = ccil_jax.make_agent(config, Walk(), walk_demonstrations(), constraint=constraint)
+        step, state = jax.jit(agent.step), agent.init(jax.random.key(3))
+        for _ in range(4):
+            state, metrics = step(state)
+        return state.actor, metrics
+
+    with quick_compilation():
+        ours, theirs = trained(None), trained(own)
+    assert 0 < theirs[1]["multiplier"] < 0.3
+    chex.assert_trees_all_equal(ours, theirs)
+
+
+def test_an_agent_can_be_differentiated() -> None:
+    """The derivative of the policy after one iteration with respect to the trust region's radius."""
+    config = walk_config(method="ccil", generator_steps=1)
+
+    def moved(max_kl: jax.Array) -> jax.Array:
+        agent = ccil_jax.make_agent(config.replace(max_kl=max_kl), Walk(), walk_demonstrations())
+        state, _ = agent.step(agent.init(jax.random.key(0)))
+        return state.actor.policy_params["log_std"][0]
+
+    with quick_compilation(), jax.enable_x64(True):
+        radius, small = jnp.asarray(0.02), 1e-5
+        _, slope = jax.jit(lambda x: jax.jvp(moved, (x,), (jnp.ones_like(x),)))(radius)
+        difference = (jax.jit(moved)(radius + small) - jax.jit(moved)(radius - small)) / (2 * small)
+    assert abs(float(slope)) > 1e-3
+    np.testing.assert_allclose(slope, difference, rtol=1e-4)
+
+
+def test_optimizer_and_critic_of_a_users_own_are_used() -> None:
+    """Plain gradient steps of size 0 leave the critics as they began."""
+    config = walk_config(method="gail")
+    critic = ccil_jax.Network(init=lambda key: jnp.ones(2), apply=lambda params, obs: obs[..., 0] * params[0])
+    agent = ccil_jax.make_agent(
+        config, Walk(), walk_demonstrations(), critic=critic, optimizer=lambda learning_rate: optax.sgd(0.0)
+    )
+    with quick_compilation():
+        state, _ = jax.jit(agent.step)(agent.init(jax.random.key(0)))
+    np.testing.assert_array_equal(state.critics.params, np.ones((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("method", "parts", "message"),
+    [
+        ("bc", {"constraint": ccil_jax.Constraint()}, "constraint: makes no difference to method bc; leave it out"),
+        ("iq_learn", {"reward_model": ccil_jax.RewardModel(lambda state, t: t.reward)}, "reward_model: makes no"),
+        ("gail", {"constraint": ccil_jax.Constraint()}, "constraint: method gail has no cost limit to keep; use ccil"),
+    ],
+)
+def test_parts_without_effect_are_refused(method: str, parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ccil_jax.make_agent(walk_config(method=method), Walk(), walk_demonstrations(), **parts)
+
+
+def test_a_row_whose_part_is_unknown_is_refused_before_anything_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(_methods, "odd", Method(reward="discriminator", constraint="pit", limit="demonstrations"))
+    with pytest.raises(ConfigError, match="constraint 'pit': unknown; did you mean pid"):
+        ccil_jax.make_agent(walk_config(method="ccil").replace(method="odd"), Walk(), walk_demonstrations())
+
+
+def test_a_reward_of_another_shape_is_refused() -> None:
+    """NumPy's rules would repeat one number along the batch."""
+    model = ccil_jax.RewardModel(lambda state, transition: jnp.mean(transition.obs))
+    agent = ccil_jax.make_agent(walk_config(method="gail"), Walk(), walk_demonstrations(), reward_model=model)
+    with pytest.raises(AssertionError, match="the reward model's rewards must be"):
+        agent.step(agent.init(jax.random.key(0)))
+
+
+@pytest.mark.parametrize(
+    ("name", "method", "message"),
+    [
+        ("ccil", Method(reward="task", constraint="pid", limit="prescribed"), "method ccil: is registered already"),
+        ("a b", Method(reward="task", constraint="pid", limit="prescribed"), "method 'a b': not an identifier"),
+        ("x", Method(reward="task"), "method x: an on-policy method needs a reward and a constraint"),
+        ("x", Method(reward="task", constraint="pid", limit="mine"), "limit 'mine': give 'demonstrations', 'pre"),  # type: ignore[arg-type]
+        ("x", Method(reward="task", constraint="pid", limit="demonstrations", imitates=False), "no demonstrations to"),
+    ],
+)
+def test_rows_that_mean_nothing_are_refused(name: str, method: Method, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ccil_jax.register_method(name, method)
+
+
+def test_a_method_is_found_by_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_methods.py").write_text(
+        "import ccil_jax\n"
+        "SAFE = ccil_jax.Method(reward='discriminator', constraint='pid', limit='demonstrations')\n"
+        "TEXT = 'pid'\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    kept = dict(_methods)
+    try:
+        assert ccil_jax.Config(method="my_methods:SAFE").row.constraint == "pid"
+        assert ccil_jax.Config(method="my_methods:SAFE").reads("pid_smoothing")
+        for name, message in (
+            ("my_methods:SAVE", "has no attribute 'SAVE'; did you mean SAFE"),
+            ("my_method:SAFE", "there is no module 'my_method'"),
+            ("my_methods:TEXT", "is of type str; name a ccil_jax.Method"),
+            ("malmm", "'malmm': unknown; did you mean malm"),
+        ):
+            with pytest.raises(ConfigError, match=message) as refused:
+                validate(ccil_jax.Config(method=name))
+            assert refused.value.on_command_line().startswith("--method ")
+    finally:
+        _methods.clear()
+        _methods.update(kept)
+        sys.modules.pop("my_methods", None)

@@ -1,0 +1,209 @@
+"""A task in a module of the user's own goes through all launchers, by its name `module:function`."""
+
+import json
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ccil_jax.demonstrations.trajectories import load_demonstrations
+from experiments import ablations, benchmark, convert, evaluate, expert, report, sweep, train
+from experiments.cli import command_line
+from experiments.cli.names import safe_name
+from experiments.runs import run_folder
+from experiments.sweeps import backends, worker
+from tests.probe_envs import quick_compilation
+
+MODULE = '''
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import executed, first_state, next_state
+
+
+class Cart:
+    """A cart on a line. The reward is its speed; a step in which it is faster than 0.1 m/s costs 1."""
+
+    name, obs_dim, action_dim = "Cart", 2, 1
+    action_low, action_high = np.full(1, -1.0, np.float32), np.full(1, 1.0, np.float32)
+
+    def __init__(self, max_episode_steps, push=0.2):
+        self.max_episode_steps, self.push = max_episode_steps, push
+
+    def reset(self, key):
+        obs = 0.1 * jax.random.normal(key, (2,))
+        return first_state(obs, obs, terms=())
+
+    def step(self, state, action):
+        speed = 0.9 * state.physics[1] + self.push * executed(self, action)[0]
+        obs = jnp.stack([state.physics[0] + 0.1 * speed, speed])
+        return next_state(
+            state, physics=obs, obs=obs, reward=speed, cost=(speed > 0.1).astype(speed.dtype),
+            terminated=jnp.zeros((), bool), terms={}, max_episode_steps=self.max_episode_steps,
+        )
+
+
+def make(max_episode_steps: int = 20, push: float = 0.2, shape: tuple = ((1, 2), (3,))):
+    return Cart(max_episode_steps, push)
+
+
+def short(push: float = 0.2):
+    return Cart(10, push)
+
+
+def broken(push):
+    return Cart(10, push)
+'''
+TASK = "my_task:make"
+TINY = ["--preset", "tiny", "--num-seeds", "2", "--eval-episodes", "3"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder of the module, which is the current one for all tests of this file, with an expert and a run there."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "my_task.py").write_text(MODULE, encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch, quick_compilation():
+        patch.chdir(folder)
+        patch.setattr(sys, "path", list(sys.path))  # importing the module adds the current folder
+        made = ["--env", TASK, "--cost-limit", "20", "--out", "expert.npz", "--run-dir", "expert", *TINY]
+        assert expert.main([*made, "--num-trajectories", "4"]) == 0
+        assert train.main(["--env", TASK, "--method", "ccil", "--demos", "expert.npz", "--out", "run", *TINY]) == 0
+        yield folder
+    sys.modules.pop("my_task", None)
+
+
+def refused(capsys: pytest.CaptureFixture[str], launcher: Any, *arguments: str) -> str:
+    """The one line of a launcher that refuses its arguments."""
+    with pytest.raises(SystemExit) as end:
+        launcher.main(list(arguments))
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    return said
+
+
+def test_demonstrations_name_the_task_and_its_options(folder: Path) -> None:
+    facts = load_demonstrations(folder / "expert.npz").metadata
+    assert (facts["task"], facts["physics"], facts["cost_limit"]) == (TASK, "auto", 20.0)
+    assert (facts["push"], facts["max_episode_steps"]) == (0.2, 20)
+    assert "shape" not in facts  # JSON has no tuples: it is left to the task
+
+
+def test_a_run_goes_on_for_longer(folder: Path) -> None:
+    assert train.main(["--resume", "--out", "run", "--env-steps", "360"]) == 0
+    assert run_folder.read_json(Path("run/summary.json"))["env_steps"] == 360
+    assert run_folder.read_metrics(Path("run"))["env_steps"][:, 0].tolist() == [120.0, 240.0, 360.0]
+    facts = run_folder.read_run(Path("run")).facts
+    assert (facts["task"], facts["env_options"]) == (TASK, {"push": 0.2, "max_episode_steps": 20})
+
+
+def test_a_run_without_a_folder_gets_one_with_a_safe_name(folder: Path) -> None:
+    assert train.main(["--env", TASK, "--method", "bc", "--bc-epochs", "1", "--demos", "expert.npz", *TINY]) == 0
+    (made,) = Path("runs").iterdir()
+    assert re.fullmatch(r"my_task_make_bc_\d{8}-\d{6}", made.name)
+    assert safe_name("a/b[0]:c d,e=1.5e-3") == "a_b_0__c d,e=1.5e-3"
+    assert command_line.default_folder("../x:y", "m:N").name.startswith(".._x_y_m_N_")
+
+
+def test_evaluate_records_and_exports(folder: Path) -> None:
+    again = ["--episodes", "3", "--seed-index", "1", "--num-trajectories", "2"]
+    assert evaluate.main(["run", *again, "--record", "more.npz", "--export", "policy.npz", "policy.stablehlo"]) == 0
+    more = load_demonstrations(Path("more.npz"))
+    assert (more.num_episodes, more.obs.shape, more.metadata["task"]) == (2, (40, 2), TASK)
+    entry = run_folder.read_json(Path("run/evaluation.json"))["ours"]
+    assert [row["episode_length"] for row in entry["per_seed"]] == [20.0, 20.0]
+    assert convert.main(["more.npz", "--env", TASK, "--out", "converted.npz"]) == 0
+
+
+def test_a_report_needs_no_animation(folder: Path) -> None:
+    assert report.main(["run", "expert", "--out", "page.html", "--figures", "figures"]) == 0
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert f"<h2>{TASK}</h2>" in page
+    assert "<canvas" not in page
+    assert [path.name for path in Path("figures").iterdir()] == ["my_task_make.png"]
+
+
+def test_a_sweep_trains_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def launch(folders: Sequence[Path], num_workers: int, logs: Path, settings: Mapping[str, Any]) -> backends.Outcomes:
+        for job in folders:
+            yield job, None if worker.main([str(job)]) == 0 else "failed"
+
+    monkeypatch.setattr(backends, "BACKENDS", {"processes": backends.Backend(launch=launch)})
+    fixed = {"preset": "tiny", "num_seeds": 1, "eval_episodes": 2, "cost_limit": 5.0, "env_steps": 120}
+    spec = {"env": "my_task:short", "method": "expert", "fixed": fixed, "grid": {"gamma": [0.9, 0.99]}}
+    Path("spec.json").write_text(json.dumps(spec), encoding="utf-8")
+    assert sweep.main(["spec.json", "--out", "sweep"]) == 0
+    for name in ("gamma=0.9", "gamma=0.99"):
+        (row,) = run_folder.read_json(Path("sweep/runs", name, "summary.json"))["per_seed"]
+        assert row["episode_length"] == 10.0
+    (program,) = Path("sweep/programs").iterdir()
+    assert program.name.startswith("my_task_short_expert_")
+
+
+EXPERT = ("--out", "x.npz", "--run-dir", "x")
+RUN = ("--method", "trpo", "--out", "x")
+
+
+@pytest.mark.parametrize(
+    ("launcher", "arguments", "message"),
+    [
+        (expert, ("--env", TASK, *EXPERT), f"--cost-limit: required, as {TASK} has no default"),
+        (evaluate, ("run", "--simulator", "original"), f"--simulator original: task {TASK} has no original"),
+        (benchmark, ("--tasks", TASK), f"--tasks {TASK}: takes no physics"),
+        (train, ("--env", TASK, *RUN, "--physics", "mjx"), f"--physics mjx: {TASK} has no such option"),
+        (train, ("--env", TASK, *RUN, "--cost-threshold", "1"), f"--cost-threshold: {TASK} has no such option"),
+        (
+            train,
+            ("--env", "my_task:short", *RUN, "--max-episode-steps", "5"),
+            "--max-episode-steps: my_task:short",
+        ),
+        (train, ("--env", TASK, "--method", "ccil"), f"no demonstrations are shipped for {TASK}"),
+        (train, ("--env", "my_task:mke", *RUN), "--env my_task:mke: "),
+        (train, ("--env", "no_such_module:make", *RUN), "--env no_such_module:make: "),
+        (train, ("--env", "my_task:broken", *RUN), "--env my_task:broken: parameter 'push'"),
+        (ablations, ("--env", "my_task:mke", "--out", "x"), "--env my_task:mke: "),
+        (
+            train,
+            ("--env", "my_task:short", "--method", "bc", "--demos", "expert.npz", "--out", "x"),
+            f"expert.npz: recorded on task '{TASK}', not 'my_task:short'",
+        ),
+    ],
+)
+def test_what_does_not_go_with_it_is_refused(
+    folder: Path, launcher: Any, arguments: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert message in refused(capsys, launcher, *arguments)
+    assert not (folder / "x").exists()
+
+
+def test_demonstrations_longer_than_an_episode_are_refused_once_that_is_known(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A task that takes no time limit has one all the same."""
+    from ccil_jax.demonstrations.trajectories import save_demonstrations
+
+    demonstrations = load_demonstrations(folder / "expert.npz")
+    demonstrations.metadata.pop("task")
+    save_demonstrations(folder / "long.npz", demonstrations)
+    given = ["--env", "my_task:short", "--method", "ccil", "--demos", "long.npz", "--out", "long", *TINY]
+    with pytest.raises(SystemExit):
+        train.main(given)
+    assert "trajectory 0 has 20 steps, an episode of this run has at most 10" in capsys.readouterr().err
+
+
+def test_a_run_whose_task_is_gone_says_so(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "my_task")
+    (folder / "my_task.py").rename(folder / "other.py")
+    try:
+        assert f"RUN_DIR run: of task {TASK}, which is not known here" in refused(capsys, evaluate, "run")
+        assert f"--env {TASK}: " in refused(capsys, train, "--resume", "--out", "run")
+        assert report.main(["run", "--out", "gone.html"]) == 0  # its files say enough
+    finally:
+        (folder / "other.py").rename(folder / "my_task.py")
