@@ -25,7 +25,7 @@ def make_parser() -> Parser:
     parser.add_argument(
         "--format",
         metavar="MODULE:NAME",
-        help="read it as your own ccil_jax.demonstrations.formats.Format, found as NAME in the Python module MODULE "
+        help="read it as your own ccil_jax.Format, found as NAME in the Python module MODULE "
         "(default: recognise the format)",
     )
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")

@@ -446,7 +446,7 @@ def test_the_converter_answers_wrong_use_in_one_line(tmp_path: Path, capsys: pyt
 TABLES = '''
 """A user's own format: a text file, whose lines are step, action and observation, cost, reward, and how it ended."""
 import numpy as np
-from ccil_jax.demonstrations.formats import Format
+from ccil_jax import Format
 
 HEADER = "# swimmer steps"
 
@@ -582,7 +582,7 @@ def test_the_converter_reads_a_format_of_the_users(
     for text, message in (
         ("own_tables:MISSING", "--format own_tables:MISSING: module 'own_tables' has no attribute 'MISSING'"),
         ("own_tables", "--format own_tables: not of the form module:attribute"),
-        ("own_tables:NOT_A_FORMAT", "--format own_tables:NOT_A_FORMAT: int is no ccil_jax.demonstrations.formats.F"),
+        ("own_tables:NOT_A_FORMAT", "--format own_tables:NOT_A_FORMAT: int is no ccil_jax.Format; give one"),
         ("no_such_module_here:X", "--format no_such_module_here:X: there is no module 'no_such_module_here'"),
     ):
         with pytest.raises(SystemExit) as end:

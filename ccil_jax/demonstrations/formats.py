@@ -91,7 +91,7 @@ def named(text: str) -> Format:
 
 def _checked_format(found: object, where: str) -> Format:
     if not isinstance(found, Format):
-        raise UserError(f"{where}: {type(found).__name__} is no ccil_jax.demonstrations.formats.Format; give one")
+        raise UserError(f"{where}: {type(found).__name__} is no ccil_jax.Format; give one")
     if not found.name:
         raise UserError(f"{where}: the format has no name; give it one")
     return found
