@@ -152,9 +152,10 @@ def _measure_here(text: str, *, profile: bool) -> None:
     """In a row's own process: measures the setting in `text` and prints the row."""
     setting = row_processes.begin_row(text)
     from experiments.speed import measuring, profiling  # import JAX
+    from experiments.speed.setting import Setting
 
     measure = profiling.profile if profile else measuring.measure
-    print(json.dumps(measure(measuring.Setting(**setting))))
+    print(json.dumps(measure(Setting(**setting))))
 
 
 def _compare(pythons: Mapping[str, Path], setting: dict[str, Any], out: Path, facts: Mapping[str, Any]) -> None:

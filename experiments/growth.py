@@ -143,8 +143,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.row is not None:
         setting = row_processes.begin_row(arguments.row)
         from experiments.speed import measuring  # imports JAX
+        from experiments.speed.setting import Setting
 
-        print(json.dumps(measuring.measure_training(measuring.Setting(**setting))))
+        print(json.dumps(measuring.measure_training(Setting(**setting))))
         return
     points = settings_of(arguments)
     command_line.check_output_folder(arguments.out, record="growth.json")

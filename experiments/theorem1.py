@@ -14,7 +14,7 @@ from pathlib import Path
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser
 from experiments.cli.tables import show
-from experiments.theory import theorem1_checks
+from experiments.theory import theorem1_checks, theorem1_methods, theorem1_problem
 from experiments.theory.theorem1_checks import Check
 
 
@@ -47,10 +47,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Computes, prints, draws; status 1 where a claim fails."""
     command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
     command_line.check_writable(arguments.out.parent, "--out")
-    problem = theorem1_checks.make_problem(arguments.seed)
+    problem = theorem1_problem.make_problem(arguments.seed)
     learners, small = theorem1_checks.bounded_learners(problem), theorem1_checks.distances(problem)
-    ccil = theorem1_checks.run_ccil(problem)
-    cvag, settled = theorem1_checks.run_cvag(problem)
+    ccil = theorem1_methods.run_ccil(problem)
+    cvag, settled = theorem1_methods.run_cvag(problem)
     checks = [
         *theorem1_checks.check_discriminator(problem),
         *theorem1_checks.check_bounded_multiplier(problem, learners),

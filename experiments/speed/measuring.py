@@ -1,10 +1,9 @@
 """One row of the benchmark: how fast physics, rollouts, training and the meta-gradient are on this machine."""
 
-import dataclasses
 import resource
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,37 +18,17 @@ from ccil_jax.acting import networks, rollout, running_statistics
 from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config
-from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.learning import constraints, policy_step
-from ccil_jax.presets import PRESETS
 from ccil_jax.training import program
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
 from envs.task_info import physics_name
+from experiments.speed.setting import Setting, make_config, noise
 from experiments.speed.turns import turn
 
 _MOST_SIMS = 1024  # of C MuJoCo, stepped for comparison
-_LONG = 1_000_000  # environment steps
 
 Work = Callable[[], int]  # does a fixed amount of work, waits for it, and returns how many units it was
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Setting:
-    """What a row measures."""
-
-    task: str
-    physics: str
-    method: str
-    num_seeds: int
-    num_envs: int
-    preset: str
-    rounds: int  # measurements of each kind, taken in turn
-    seconds: float  # least duration of one measurement
-    seed: int
-    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to the preset: fields of `Config`
-    num_demonstration_steps: int = 10_000
-    turns: str | None = None  # a file: what is measured beside others waits until none of them compiles or measures
 
 
 def measure_training(setting: Setting) -> dict[str, Any]:
@@ -69,16 +48,6 @@ def measure_training(setting: Setting) -> dict[str, Any]:
         "peak_memory": _peak_memory(),
         "all_rates": rates,
     }
-
-
-def make_config(setting: Setting) -> Config:
-    """Of the training that is measured: two iterations, which make a chunk, or a single long one."""
-    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in setting.changes.items()}
-    chosen = {"method": setting.method, "num_envs": setting.num_envs}
-    # Where a limit is prescribed, any will do: it does not matter for the speed.
-    config = Config.from_base({"cost_limit": 0.0, **PRESETS[setting.preset], **changes}, chosen)
-    num_iterations = 2 if setting.num_seeds * config.steps_per_iteration < _LONG else 1
-    return config.replace(env_steps=num_iterations * config.steps_per_iteration)
 
 
 def measure(setting: Setting) -> dict[str, Any]:
@@ -206,21 +175,6 @@ def spread(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
     mesh, spec = meshes.run_mesh(num_seeds), jax.P("runs")
     return jax.jit(
         jax.shard_map(full_precision(jax.vmap(function)), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
-    )
-
-
-def noise(env: Any, setting: Setting) -> Demonstrations:
-    """Demonstrations of the right shapes, whose content does not matter for the time it takes to learn from them."""
-    random = np.random.default_rng(setting.seed)
-    num_steps = setting.num_demonstration_steps
-    return Demonstrations(
-        obs=random.standard_normal((num_steps, env.obs_dim)).astype(np.float32),
-        actions=random.uniform(env.action_low, env.action_high, (num_steps, env.action_dim)).astype(np.float32),
-        rewards=None,
-        costs=np.ones(num_steps, np.float32),
-        terminated=np.zeros(num_steps, bool),
-        truncated=np.arange(num_steps) % 1000 == 999,
-        episode_ends=np.arange(1000, num_steps + 1, 1000),
     )
 
 

@@ -18,16 +18,14 @@ from ccil_jax.learning.policy_step import PolicyStep
 from ccil_jax.types import Batch, Transition
 from envs.task_info import physics_name
 from experiments.speed.measuring import (
-    Setting,
     Work,
-    make_config,
-    noise,
     physics_work,
     rate_of,
     spread,
     training_work,
     wait,
 )
+from experiments.speed.setting import Setting, make_config, noise
 
 PHYSICS = "physics alone"
 
