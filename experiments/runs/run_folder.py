@@ -160,7 +160,7 @@ def was_continued(run: Run, summary: Mapping[str, Any]) -> bool:
 
 
 def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:
-    """Writes config.json: `facts` (task, physics, command, seeds, ...), versions, commit, and the fields of `config`."""
+    """Writes config.json: `facts` (task, physics, command, seeds, ...), versions, commit, and all hyperparameters."""
     made_by = {"versions": versions(), "git_commit": git_commit()}
     content = {**facts, **made_by, "config": dataclasses.asdict(config)}
     write_json(folder / "config.json", content)

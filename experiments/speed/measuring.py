@@ -26,13 +26,13 @@ from envs.task_info import physics_name
 from experiments.speed.setting import Setting, make_config, noise
 from experiments.speed.turns import turn
 
-_MOST_SIMS = 1024  # of C MuJoCo, stepped for comparison
+_MOST_SIMS = 1024  # simulations of C MuJoCo that are stepped for comparison, at most
 
-Work = Callable[[], int]  # does a fixed amount of work, waits for it, and returns how many units it was
+Work = Callable[[], int]  # does a fixed amount of work, waits until it is done, and returns the number of units
 
 
 def measure_training(setting: Setting) -> dict[str, Any]:
-    """Whole training alone: seconds per iteration (the median), seconds to compile, and peak memory."""
+    """Measures whole training only: seconds per iteration (the median), seconds to compile, and peak memory."""
     env: Any = envs.make(setting.task, physics=setting.physics)
     config = make_config(setting)
     training, compile_seconds = training_work(config, env, setting)
@@ -51,7 +51,7 @@ def measure_training(setting: Setting) -> dict[str, Any]:
 
 
 def measure(setting: Setting) -> dict[str, Any]:
-    """Measures everything in turn, `rounds` times, and returns medians.
+    """Measures each kind of work once per round, and returns medians over the rounds.
 
     Rates are control steps of all seeds per second; a control step is `num_substeps` engine steps.
     `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does (but see
@@ -109,7 +109,7 @@ def rate_of(work: Work, seconds: float) -> float:
 
 
 def _peak_memory() -> float:
-    """`peak_memory` of a row, MiB: the most that was allocated on the accelerators, or else this process's size."""
+    """Peak memory in MiB: allocated on all accelerators, or without an accelerator the resident size of the process."""
     on_devices = [device.memory_stats() for device in jax.local_devices()]
     if all(on_devices):  # None on a CPU
         return sum(stats["peak_bytes_in_use"] for stats in on_devices if stats) / 2**20
@@ -118,9 +118,9 @@ def _peak_memory() -> float:
 
 
 def physics_work(env: Any, setting: Setting) -> Work:
-    """The engine alone, from states after a reset: no JAX, no observations, rewards or further resets.
+    """Steps the engine alone, from states after a reset: without JAX, observations, rewards and further resets.
 
-    Of many simulations only some: its rate does not grow any more, but each takes memory.
+    At most `_MOST_SIMS` simulations are stepped: more would not raise the rate, and each takes memory.
     """
     from envs.physics.native import usable_cpus
 
@@ -145,7 +145,7 @@ def physics_work(env: Any, setting: Setting) -> Work:
 
 
 def rollout_work(config: Config, env: Any, setting: Setting) -> Work:
-    """Policy and environment inside one compiled program, without learning."""
+    """Runs the policy in the environment, inside one compiled program, without learning."""
     policy = networks.make_policy(config, env.obs_dim, env.action_dim)
 
     def init(key: jax.Array) -> tuple[Any, Any]:
@@ -171,7 +171,7 @@ def rollout_work(config: Config, env: Any, setting: Setting) -> Work:
 
 
 def spread(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
-    """A function of one seed as one of all, [S]-leading, on as many devices as training uses."""
+    """Turns a function of one seed into one of all seeds, [S]-leading, on the same devices as training uses."""
     mesh, spec = meshes.run_mesh(num_seeds), jax.P("runs")
     return jax.jit(
         jax.shard_map(full_precision(jax.vmap(function)), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
@@ -179,7 +179,7 @@ def spread(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
 
 
 def training_work(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
-    """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
+    """Runs whole iterations as `train` does. The second value is the seconds that it took to compile them."""
     expert = noise(env, setting)
     resolved = build.resolve(config, env, expert)
     compiled = program.compile_program(resolved, env, expert_data(expert), setting.num_seeds)

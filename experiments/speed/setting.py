@@ -10,7 +10,7 @@ from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.presets import PRESETS
 
-_LONG = 1_000_000  # environment steps
+_LONG = 1_000_000  # environment steps of an iteration of all seeds, from which on one iteration is measured, not two
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -23,26 +23,28 @@ class Setting:
     num_seeds: int
     num_envs: int
     preset: str
-    rounds: int  # measurements of each kind, taken in turn
-    seconds: float  # least duration of one measurement
+    rounds: int  # number of measurements of each kind; in every round each kind is measured once
+    seconds: float  # shortest duration of one measurement
     seed: int
-    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to the preset: fields of `Config`
+    changes: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # fields of `Config` that differ from the preset
     num_demonstration_steps: int = 10_000
-    turns: str | None = None  # a file: what is measured beside others waits until none of them compiles or measures
+    turns: str | None = None  # lock file, see `turns.turn`
 
 
 def make_config(setting: Setting) -> Config:
-    """Of the training that is measured: two iterations, which make a chunk, or a single long one."""
+    """The configuration of the training that is measured: two iterations, which make a chunk, or a single long one."""
     changes = {name: tuple(value) if isinstance(value, list) else value for name, value in setting.changes.items()}
     chosen = {"method": setting.method, "num_envs": setting.num_envs}
-    # Where a limit is prescribed, any will do: it does not matter for the speed.
+    # A method with a prescribed limit needs one. Its value does not matter for the speed.
     config = Config.from_base({"cost_limit": 0.0, **PRESETS[setting.preset], **changes}, chosen)
     num_iterations = 2 if setting.num_seeds * config.steps_per_iteration < _LONG else 1
     return config.replace(env_steps=num_iterations * config.steps_per_iteration)
 
 
 def noise(env: Any, setting: Setting) -> Demonstrations:
-    """Demonstrations of the right shapes, whose content does not matter for the time it takes to learn from them."""
+    """Random demonstrations of the right shapes. Their content does not matter for the speed of learning."""
     random = np.random.default_rng(setting.seed)
     num_steps = setting.num_demonstration_steps
     return Demonstrations(

@@ -1,4 +1,4 @@
-"""The claims of Theorem 1, each computed exactly and set beside what is allowed."""
+"""The claims of Theorem 1, each computed exactly and compared with the largest error allowed."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from experiments.theory.tabular import Array, Solution
 from experiments.theory.theorem1_methods import NUM_ROUNDS, Run
 from experiments.theory.theorem1_problem import BETA, Problem, random_occupancies
 
-BOUNDS = np.geomspace(1e-2, 1e2, 41)  # L, of the multiplier
+BOUNDS = np.geomspace(1e-2, 1e2, 41)  # L: upper bounds of the multiplier
 BETAS = np.geomspace(1e-4, 1e-2, 9)
 
 
@@ -29,7 +29,7 @@ class Check:
 
 
 def check_discriminator(problem: Problem) -> list[Check]:
-    """Equation 2, maximised entry by entry without calculus: golden sections, for 20 random learners."""
+    """Equation 2, maximised numerically entry by entry (bounded scalar search), for 20 random learners."""
     from scipy.optimize import minimize_scalar
 
     value_error = argument_error = 0.0
@@ -55,12 +55,12 @@ def check_discriminator(problem: Problem) -> list[Check]:
 
 
 def bounded_learners(problem: Problem) -> list[Solution]:
-    """The cheap expert's learners for each bound L of the multiplier."""
+    """The learner of the cheap expert for each bound L of the multiplier."""
     return [tabular.saddle(problem.process, problem.cheap, BETA, bound) for bound in BOUNDS]
 
 
 def check_bounded_multiplier(problem: Problem, learners: Sequence[Solution]) -> list[Check]:
-    """psi* with lambda in [0, L] is 2 JS - log 4 + L [J - J_E]_+: an exact penalty from L = lambda* on."""
+    """With lambda in [0, L], psi* is 2 JS - log 4 + L [J - J_E]_+, which is an exact penalty for L >= lambda*."""
     process, solution = problem.process, problem.bound_by_cheap
     expert_cost = process.episode_cost(problem.cheap)
     worst = 0.0
@@ -86,7 +86,7 @@ def check_bounded_multiplier(problem: Problem, learners: Sequence[Solution]) -> 
 
 
 def check_minimax(problem: Problem) -> list[Check]:
-    """min max = max min: soft value iteration, which knows no convexity, gives D* and lambda* the same value."""
+    """min max = max min: the dual function at (D*, lambda*), by soft value iteration, has the value of the minimum."""
     checks = []
     for name, expert, solution in (
         ("cheap", problem.cheap, problem.bound_by_cheap),
@@ -117,7 +117,7 @@ def check_minimax(problem: Problem) -> list[Check]:
 
 
 def check_slackness(problem: Problem) -> list[Check]:
-    """lambda* (J - J_E) = 0: the multiplier is positive only where the cost meets the expert's."""
+    """Complementary slackness, lambda* (J - J_E) = 0: the multiplier is positive only if J = J_E."""
     excess = {
         name: problem.process.episode_cost(solution.rho) - problem.process.episode_cost(expert)
         for name, expert, solution in (
@@ -134,13 +134,13 @@ def check_slackness(problem: Problem) -> list[Check]:
 
 
 def distances(problem: Problem) -> Array:
-    """Of the learner from the cheap expert, largest difference of occupancy, for each of `BETAS`."""
+    """The largest difference of occupancy between learner and cheap expert, for each of `BETAS`."""
     learners = (tabular.saddle(problem.process, problem.cheap, beta) for beta in BETAS)
     return np.array([np.max(np.abs(x.rho - problem.cheap)) for x in learners])
 
 
 def check_small_entropy(found: Array) -> list[Check]:
-    """beta -> 0 recovers the expert, linearly."""
+    """As beta goes to 0, the learner goes to the expert, and the distance is proportional to beta."""
     slope = np.polyfit(np.log(BETAS), np.log(found), 1)[0]
     return [
         Check("beta -> 0 recovers the expert: distance at beta = 1e-4", float(found[0]), 1e-2),
@@ -149,7 +149,7 @@ def check_small_entropy(found: Array) -> list[Check]:
 
 
 def check_methods(problem: Problem, ccil: Run, cvag: Run, settled: Solution) -> list[Check]:
-    """CCIL converges to the saddle point, CVAG slides along J = J_E."""
+    """CCIL converges to the saddle point; CVAG stays close to J = J_E, on alternating sides of it."""
     expert_cost, half = problem.process.episode_cost(problem.cheap), NUM_ROUNDS // 2
     error = abs(ccil.multiplier[-1] - problem.bound_by_cheap.multiplier)
     sliding = float(np.mean(cvag.cost[half:])) - expert_cost

@@ -1,4 +1,4 @@
-"""The figure of `theorem1`: six panels."""
+"""The figure of the launcher `theorem1`, with six panels."""
 
 from collections.abc import Sequence
 from pathlib import Path

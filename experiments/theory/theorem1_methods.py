@@ -1,4 +1,4 @@
-"""CCIL and CVAG as the paper prints them, with exact gradients, on the process of Theorem 1."""
+"""CCIL and CVAG with exact gradients, on the process of Theorem 1."""
 
 import dataclasses
 
@@ -16,18 +16,18 @@ class Run:
     """An iterative method on the cheap expert, after each round."""
 
     cost: Array  # [rounds] J
-    multiplier: Array  # [rounds] lambda, or of CVAG the one that its share of reward steps amounts to
-    distance: Array  # [rounds] largest difference of an occupancy from the solution's
+    multiplier: Array  # [rounds] lambda; for CVAG (1 - a) / a, where a is its share of reward steps
+    distance: Array  # [rounds] largest difference between the occupancy and that of the solution
 
 
 def imitation_reward(problem: Problem, policy: Array) -> tuple[Array, Array]:
-    """The policy's occupancy, and -log D* less beta log pi: the slope of its entropy is part of the reward."""
+    """The occupancy of the policy, and its reward -log D* - beta log pi, which includes the slope of the entropy."""
     rho = problem.process.occupancy(policy)
     return rho, -np.log(tabular.best_discriminator(rho, problem.cheap)) - BETA * np.log(policy)
 
 
 def run_ccil(problem: Problem, size: float = 0.2, rate: float = 0.5) -> Run:
-    """CCIL: a natural step on reward less lambda times cost, then dual ascent on the gap."""
+    """CCIL: each round is a natural gradient step on reward - lambda cost, then dual ascent on the gap J - J_E."""
     process, expert_cost = problem.process, problem.process.episode_cost(problem.cheap)
     policy, multiplier, rows = np.full(problem.cheap.shape, 1 / problem.cheap.shape[1]), 0.0, []
     for _ in range(NUM_ROUNDS):
@@ -41,10 +41,10 @@ def run_ccil(problem: Problem, size: float = 0.2, rate: float = 0.5) -> Run:
 
 
 def run_cvag(problem: Problem, size: float = 0.01) -> tuple[Run, Solution]:
-    """CVAG: a step on the reward while J is at most J_E, else on less cost; both with entropy, as printed.
+    """CVAG: each round is a step on the reward if J <= J_E, otherwise on the negative cost; both with entropy.
 
-    The second value is what it should settle at. With a share a of reward steps the mean step is a (reward) - (1 - a)
-    (cost) + beta (entropy), so lambda = (1 - a) / a, and the entropy weighs beta / a.
+    The second value is the solution that it should stay close to. With a share a of reward steps, the mean step is
+    a (reward) - (1 - a) (cost) + beta (entropy). So lambda = (1 - a) / a, and the weight of the entropy is beta / a.
     """
     process, expert_cost = problem.process, problem.process.episode_cost(problem.cheap)
     policy, rows = np.full(problem.cheap.shape, 1 / problem.cheap.shape[1]), []

@@ -8,12 +8,12 @@ import numpy as np
 from experiments.theory import tabular
 from experiments.theory.tabular import Array, Process, Solution
 
-BETA = 0.1  # without entropy the learner just matches the expert, cost and all: nothing would be tested
+BETA = 0.1  # weight of the entropy. Without it the learner would equal the expert, and no constraint would be active
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Problem:
-    """A process with a cheap and a costly expert, and the learners of both."""
+    """A process with a cheap and a costly expert, given by their occupancies, and the learners of both."""
 
     process: Process
     cheap: Array
@@ -24,9 +24,9 @@ class Problem:
 
 
 def make_problem(seed: int) -> Problem:
-    """Draws processes until one expert's cost binds its learner and the other's does not.
+    """Draws processes until the constraint is active for the learner of one expert and inactive for that of the other.
 
-    Both experts maximise a random reward and some entropy; the one avoids cost, the other seeks it.
+    Both experts maximise a random reward and some entropy; one of them avoids costs, the other seeks them.
     """
     random = np.random.default_rng(seed)
     while True:
