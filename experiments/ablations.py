@@ -1,4 +1,4 @@
-"""Ablations: trains variants of a method that differ in one choice, and compares their results and speeds.
+"""Trains variants of a method that differ in one choice, and compares their results and speeds.
 
 Each question compares several answers; the first one is the baseline. All variants start from the preset `paper` unless
 another one is given, so that the baseline is what that preset has. Variants that differ only in numbers inside the

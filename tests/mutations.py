@@ -151,8 +151,9 @@ MUTATIONS = (
     Mutation(
         "a reset hides the true successor",
         "ccil_jax/acting/rollout.py",
-        "next_obs=stepped.obs,",
-        "next_obs=jax.vmap(refresh)(stepped, reset_keys).obs,",
+        "transition = _transition(state, action, stepped)",
+        "seen = dataclasses.replace(stepped, obs=jax.vmap(reset_if_done)(stepped, reset_keys).obs)"
+        "; transition = _transition(state, action, seen)",
         ("tests/test_episodes.py",),
     ),
     Mutation(

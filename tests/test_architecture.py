@@ -294,3 +294,17 @@ def test_the_readme_draws_the_folders_in_the_order_of_their_imports() -> None:
     assert sorted(launchers) == sorted(
         name.removeprefix("experiments.") for name in SOURCES if name.startswith("experiments.") and not wing_of(name)
     )
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_no_function_has_more_than_sixty_lines(name: str) -> None:
+    """Its docstring aside."""
+    functions = [node for node in ast.walk(TREES[name]) if isinstance(node, ast.FunctionDef)]
+    assert [node.name for node in functions if length(node) > 60] == []
+
+
+def length(function: ast.FunctionDef) -> int:
+    first = function.body[0]
+    is_docstring = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+    described = (first.end_lineno or 0) - first.lineno + 1 if is_docstring else 0
+    return (function.end_lineno or 0) - function.lineno + 1 - described

@@ -86,7 +86,10 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "no method": (("train", "--env", "Swimmer"), "--method: required"),
     "no task": (("train", "--method", "malm"), "--env: required"),
     "unknown task": ((*TRAIN, "--env", "Swimer"), "--env Swimer: unknown task; did you mean Swimmer?"),
-    "unknown method": ((*TRAIN, "--method", "mallm"), "--method 'mallm': unknown; did you mean malm? choose one of"),
+    "unknown method": (
+        (*TRAIN, "--method", "mallm"),
+        "--method 'mallm': unknown; did you mean malm? choose one of malm",
+    ),
     "unknown physics": ((*TRAIN, "--physics", "bullet"), "--physics: invalid choice: 'bullet'"),
     "unknown preset": ((*TRAIN, "--preset", "big"), "--preset: invalid choice: 'big'"),
     "misspelt option": ((*TRAIN, "--max_kll", "0.1"), "--max-kll: unknown; did you mean --max-kl?"),

@@ -1,14 +1,17 @@
 """Evaluation: every seed plays episodes of its own, whatever else is evaluated beside it."""
 
+import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax.acting import evaluation, networks, running_statistics
+from ccil_jax.acting import evaluation, networks, rollout, running_statistics
 from ccil_jax.acting.evaluation import Evaluation
 from ccil_jax.acting.rollout import Actor
+from envs.base import State
 from tests.probe_envs import Walk, same_bits, walk_config
 
 CONFIG = walk_config(method="trpo")
@@ -56,3 +59,27 @@ def test_the_random_policys_episodes_do_not_depend_on_how_they_are_shared(monkey
     np.testing.assert_allclose(few.episode_return, many.episode_return[:, :4], rtol=1e-5)
     monkeypatch.setattr(evaluation, "usable_devices", lambda: [None] * 3)
     assert same_bits(evaluation.random_policy(Walk(), num_episodes=7, seed=5), many)
+
+
+@dataclasses.dataclass(frozen=True)
+class Column(Walk):
+    """Returns its reward as [1] instead of []."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        stepped = super().step(state, action)
+        return dataclasses.replace(stepped, reward=stepped.reward[None])
+
+
+def test_what_a_policy_or_an_environment_returns_must_have_the_right_shape() -> None:
+    """A column in the place of numbers would be broadcast without an error."""
+    for env, width in ((Walk(), 3), (Column(), 1)):
+        with pytest.raises(AssertionError, match="shape"):
+            evaluation.run_episodes(env, lambda obs, key, k=width: jnp.zeros((len(obs), k)), 2, jax.random.key(0))
+    policy = networks.make_policy(CONFIG, Walk().obs_dim, 3)
+    three = Actor(policy_params=policy.init(jax.random.key(1)), obs_statistics=None)
+    for env, apply, params in (
+        (Walk(), policy.apply, three),
+        (Column(), networks.make_policy(CONFIG, 2, 1).apply, jax.tree.map(lambda leaf: leaf[0], actor(1))),
+    ):
+        with pytest.raises(AssertionError, match="shape"):
+            rollout.rollout(env, apply, params, rollout.init(env, 2, jax.random.key(0)), 3, jax.random.key(1))

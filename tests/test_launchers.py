@@ -51,7 +51,7 @@ def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleTyp
     preset = re.search(r"hyperparameters to start from \(default: (\w+)\)", text)
     assert preset
     assert PRESETS[preset[1]].get("batch_size", Config().batch_size) == batch_size
-    assert f"K (Table 1) (default: {batch_size}; static)" in text
+    assert f"batch of its own (Table 1) (default: {batch_size}; static)" in text
 
 
 def _every_option() -> list[str]:

@@ -244,36 +244,6 @@ def test_looking_up_a_name_imports_no_jax(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=True)
 
 
-# Types ---------------------------------------------------------------------------------------------------------------
-
-TYPED = """
-import envs
-envs.make("Ant", "native", max_episode_steps=3, num_threads=1, cost_threshold=0.5, contact_cost=False)
-envs.make("Mine", options={"size": 3})
-given: dict[str, object] = {}
-env: envs.Environment = envs.make("Swimmer")
-cheaper: envs.Environment = envs.with_cost(env, lambda before, action, after: action.sum())
-vector: envs.GymnasiumVectorEnv = envs.GymnasiumVectorEnv(env, 3)
-envs.make("Swimmer", max_episode_step=3)  # wrong
-envs.make("Swimmer", max_episode_steps="3")  # wrong
-envs.with_costs  # wrong
-"""
-
-
-def test_an_editor_tells_a_wrong_keyword(tmp_path: Path) -> None:
-    """By mypy, as strictly as a user can ask for; the package says by its `py.typed` that it has types."""
-    mypy = pytest.importorskip("mypy.api")
-    (tmp_path / "user.py").write_text(TYPED, encoding="utf-8")
-    root = Path(envs.__file__).parent.parent
-    (tmp_path / "mypy.ini").write_text(f"[mypy]\nstrict = true\nmypy_path = {root}\nfollow_imports = silent\n")
-    assert (root / "envs" / "py.typed").is_file()
-    found, problems, _ = mypy.run(["--config-file", str(tmp_path / "mypy.ini"), str(tmp_path / "user.py")])
-    assert not problems
-    wrong = [1 + i for i, line in enumerate(TYPED.splitlines()) if line.endswith("# wrong")]
-    errors = [line for line in found.splitlines() if "user.py" in line and ": error:" in line]
-    assert sorted({int(line.rpartition("user.py:")[2].partition(":")[0]) for line in errors}) == wrong, found
-
-
 # Engines -------------------------------------------------------------------------------------------------------------
 
 

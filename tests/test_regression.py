@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from ccil_jax.learning import regression
 from ccil_jax.learning.regression import Critic
@@ -73,3 +74,12 @@ def test_the_loss_is_the_mean_square_error_of_the_last_epoch() -> None:
     obs, target, params = rng.normal(size=(8, 2)), rng.normal(size=8), np.array([0.3, -0.1])
     _, loss = fit(obs.astype(np.float32), target.astype(np.float32), params.astype(np.float32), num_epochs=2)
     np.testing.assert_allclose(loss, np.mean((obs @ params - target) ** 2), rtol=1e-5)
+
+
+def test_a_network_that_returns_a_column_is_refused() -> None:
+    """[M, 1] less [M] would be [M, M] without an error."""
+    obs, target = np.ones((8, 2), np.float32), np.ones(8, np.float32)
+    with pytest.raises(AssertionError, match=r"\(4, 1\)"):
+        fit(obs, target, np.ones((2, 1), np.float32))
+    with pytest.raises(AssertionError, match=r"\(8, 1\)"):
+        fit(obs, target[:, None], np.ones(2, np.float32))

@@ -83,3 +83,23 @@ def test_values_of_successors_are_those_of_every_successor_evaluated(bootstrap_a
     counts = np.broadcast_to(~no_future[:, None], expected.shape)
     np.testing.assert_allclose(np.asarray(found)[counts], expected[counts], rtol=1e-12)
     assert np.all(np.isfinite(found))  # those without a future are multiplied by zero
+
+
+def test_arrays_of_other_shapes_and_types_are_refused() -> None:
+    """What would be broadcast without an error: a column of rewards, one environment's values, flags as numbers."""
+    signal, flags = jnp.zeros((3, 2)), jnp.zeros((3, 2), bool)
+    for wrong in ({"signal": signal[..., None]}, {"value": signal[:, :1]}, {"done": signal}, {"terminated": flags[:1]}):
+        given = {"signal": signal, "value": signal, "next_value": signal, "terminated": flags, "done": flags} | wrong
+        with pytest.raises(AssertionError):
+            gae(**given, gamma=0.9, gae_lambda=0.9)
+    with pytest.raises(AssertionError, match=r"\(3, 2, 1\)"):
+        gae(signal[..., None], signal, signal, flags, flags, 0.9, 0.9)
+
+
+def test_critics_that_return_a_column_are_refused() -> None:
+    """[N, 1] in the place of [N] would become [N, N] without an error."""
+    flags, next_obs = jnp.zeros((3, 2), bool), jnp.zeros((3, 2, 4))
+    with pytest.raises(AssertionError, match=r"\(2, 1\)"):
+        successor_values(lambda obs: obs[:, :1], jnp.zeros((3, 2)), next_obs, flags, flags)
+    with pytest.raises(AssertionError):
+        successor_values(lambda obs: obs[:, 0], jnp.zeros((3, 2)), next_obs[0], flags, flags)

@@ -376,3 +376,29 @@ def test_the_length_of_a_step_is_the_radius_whatever_the_scale_of_the_weights() 
             moved = np.asarray(trust_region.propose(jnp.zeros(5), along, jnp.array(weights), 0.01, fraction))
             np.testing.assert_allclose(moved @ a @ moved / 2, fraction**2 * 0.01, rtol=1e-8)
             assert moved @ (np.array(weights) @ b) > 0
+
+
+# What a user's own parts return ---------------------------------------------------------------------------------------
+
+
+def test_what_the_caller_s_functions_return_must_have_the_right_shape() -> None:
+    gradients = jnp.ones((2, 3))
+    along = trust_region.directions(matrix_product(np.eye(3, dtype=np.float32)), gradients, 3)
+
+    def step(evaluate: Any, num_objectives: int = 2) -> None:
+        weights = jnp.ones(num_objectives)
+        trust_region.step(jnp.zeros(3), along, weights, evaluate, max_kl=0.5, kl_tolerance=1.5, num_halvings=3)
+
+    step(lambda params: (params[:2], jnp.sum(params**2)))
+    for evaluate in (
+        lambda params: (params[:1], jnp.sum(params**2)),  # one objective would be broadcast to both
+        lambda params: (params[:2], params[:1]),  # a KL divergence of each sample, not their mean
+    ):
+        with pytest.raises(AssertionError, match="shape"):
+            step(evaluate)
+    with pytest.raises(AssertionError, match="shape"):
+        step(lambda params: (params[:1], jnp.sum(params**2)), num_objectives=1)
+    with pytest.raises(AssertionError, match="shape"):
+        trust_region.directions(lambda vectors: vectors[:, :1], gradients, 3)
+    with pytest.raises(AssertionError, match="rank"):
+        trust_region.directions(lambda vector: vector, gradients[0], 3)

@@ -20,7 +20,23 @@ def wrong_keywords() -> None:
     envs.register("Mine", dict, costs="effort")  # type: ignore[call-arg]
 
 
+def right_uses() -> None:
+    """Nothing to report."""
+    env: envs.Environment = envs.make("Ant", "native", max_episode_steps=3, cost_threshold=0.5, contact_cost=False)
+    envs.make("Mine", options={"size": 3})
+    cheaper: envs.Environment = envs.with_cost(env, lambda before, action, after: action.sum())
+    vector: envs.GymnasiumVectorEnv = envs.GymnasiumVectorEnv(cheaper, 3)
+    assert vector is not None
+
+
+def wrong_names() -> None:
+    """Names that the packages do not have."""
+    envs.with_costs  # type: ignore[attr-defined]  # noqa: B018
+    ccil_jax.trian  # type: ignore[attr-defined]  # noqa: B018
+
+
 def wrong_types() -> None:
     """Values of another kind."""
+    envs.make("Swimmer", max_episode_steps="3")  # type: ignore[arg-type]
     ccil_jax.Config(env_steps="many")  # type: ignore[arg-type]
     ccil_jax.Config.from_preset("paper", hidden_sizes=64)  # type: ignore[arg-type]

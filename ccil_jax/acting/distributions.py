@@ -1,7 +1,8 @@
-"""Diagonal Gaussians, plain or squashed into the range of the actions: the policy's distribution over actions."""
+"""The policy's distribution over actions: a diagonal Gaussian, plain or squashed into the range of the actions."""
 
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -10,15 +11,15 @@ from jaxtyping import Array, Float
 
 @struct.dataclass(kw_only=True)
 class Gaussian:
-    """A batch of independent normal distributions over actions."""
+    """Normal distributions over actions, one for each state of a batch; entries of an action are independent."""
 
     mean: jax.Array  # [..., action_dim]
-    log_std: jax.Array  # [action_dim], or [..., action_dim] inside a `TanhGaussian`
+    log_std: jax.Array  # [action_dim], the same in every state; [..., action_dim] inside a `TanhGaussian`
 
 
 @struct.dataclass(kw_only=True)
 class TanhGaussian:
-    """Actions `center + half_range * u`, u = tanh of a Gaussian whose deviation depends on the state."""
+    """Actions center + half_range * u, where u is tanh of a Gaussian whose standard deviation depends on the state."""
 
     gaussian: Gaussian  # both leaves [..., action_dim]
     center: jax.Array  # [action_dim]
@@ -26,32 +27,42 @@ class TanhGaussian:
 
 
 def sample(distribution: Gaussian | TanhGaussian, noise: Float[Array, "... A"]) -> Float[Array, "... A"]:
-    """The actions that standard normal `noise` maps to; no noise gives the mode (of the Gaussian before squashing)."""
+    """The actions that standard normal `noise` maps to: mean + std * noise, squashed where the distribution is.
+
+    Zero noise gives the mode (that of the Gaussian before it is squashed).
+
+    Raises:
+        AssertionError: the distribution's means have another shape than the noise.
+    """
     if isinstance(distribution, TanhGaussian):
         unit = jnp.tanh(sample(distribution.gaussian, noise))
         return _wide(distribution.center, unit) + _wide(distribution.half_range, unit) * unit
+    chex.assert_equal_shape([distribution.mean, noise])
     return distribution.mean + _wide(jnp.exp(distribution.log_std), noise) * noise
 
 
 def sample_unit(
     distribution: TanhGaussian, noise: Float[Array, "... A"]
 ) -> tuple[Float[Array, "... A"], Float[Array, "..."]]:
-    """The squashed sample u in (-1, 1), before it is scaled to the actions' range, and its log density in u, nats."""
+    """The squashed sample u in (-1, 1), before it is scaled to the range of the actions, and its log density, nats.
+
+    The density is that of u: log N(x; mean, std) - log(1 - tanh(x)^2), summed over the entries of x = atanh(u).
+    """
     raw = sample(distribution.gaussian, noise)
-    # log(1 - tanh(x)^2), which loses no precision where tanh saturates
+    # log(1 - tanh(x)^2) in a form that loses no precision where tanh is close to 1 or -1
     log_slope = 2 * (math.log(2) - raw - jax.nn.softplus(-2 * raw))
     density = -0.5 * (noise**2 + math.log(2 * math.pi)) - distribution.gaussian.log_std - log_slope
     return jnp.tanh(raw), jnp.sum(density, axis=-1)
 
 
 def log_prob(distribution: Gaussian, action: Float[Array, "... A"]) -> Float[Array, "..."]:
-    """Log density of `action`, nats, summed over action dimensions."""
+    """Log density of `action`, nats, summed over the entries of the action."""
     standardized = (action - distribution.mean) * _wide(jnp.exp(-distribution.log_std), action)
     return -0.5 * jnp.sum(standardized**2 + math.log(2 * math.pi), axis=-1) - jnp.sum(distribution.log_std)
 
 
 def kl_divergence(old: Gaussian, new: Gaussian) -> Float[Array, "..."]:
-    """KL(old || new), nats, summed over action dimensions."""
+    """The Kullback-Leibler divergence KL(old || new), nats, summed over the entries of the action."""
     variance_ratio = jnp.exp(2 * (old.log_std - new.log_std))
     shift = (old.mean - new.mean) * _wide(jnp.exp(-new.log_std), new.mean)
     spread = _wide(new.log_std - old.log_std, shift)
@@ -59,16 +70,16 @@ def kl_divergence(old: Gaussian, new: Gaussian) -> Float[Array, "..."]:
 
 
 def entropy(distribution: Gaussian) -> Float[Array, ""]:
-    """Differential entropy, nats; the same in every state."""
+    """Differential entropy, nats. It is the same in every state, as the standard deviations are."""
     return jnp.sum(distribution.log_std + 0.5 * math.log(2 * math.pi * math.e))
 
 
 def fisher_product(distribution: Gaussian, tangent: Gaussian) -> Gaussian:
-    """The Fisher information in (mean, log_std) coordinates, per sample, times a tangent: diag(1/std^2, 2)."""
+    """The Fisher matrix of one sample in the coordinates (mean, log_std), diag(1 / std^2, 2), times `tangent`."""
     precision = _wide(jnp.exp(-2 * distribution.log_std), tangent.mean)
     return Gaussian(mean=tangent.mean * precision, log_std=2 * tangent.log_std)
 
 
 def _wide(per_action: jax.Array, like: jax.Array) -> jax.Array:
-    """[..., A]: what is the same in every state, for each of the states of `like`."""
+    """What is the same in every state, [A], repeated for each of the states of `like`, [..., A]."""
     return jnp.broadcast_to(per_action, like.shape)

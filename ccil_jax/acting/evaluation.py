@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,8 @@ from flax import struct
 from jax.sharding import NamedSharding, PartitionSpec
 
 from ccil_jax.acting import networks
-from ccil_jax.acting.rollout import Actor, act
+from ccil_jax.acting.networks import Policy
+from ccil_jax.acting.rollout import Actor, act, check_step
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.meshes import run_mesh, usable_devices
@@ -30,32 +32,39 @@ class Evaluation:
 
 
 @struct.dataclass(kw_only=True)
-class Episodes:
-    """Steps [T, N] of N episodes side by side; `valid` is false after an episode's end."""
+class Trajectories:
+    """N episodes side by side, T the time limit. Steps after the end of an episode are there too, but not `valid`."""
 
-    obs: jax.Array
-    action: jax.Array  # as executed: clipped to the environment's range
-    reward: jax.Array
-    cost: jax.Array
-    terminated: jax.Array
-    truncated: jax.Array
-    valid: jax.Array
+    obs: jax.Array  # [T, N, obs_dim]
+    action: jax.Array  # [T, N, action_dim] as executed: clipped to the environment's range
+    reward: jax.Array  # [T, N]
+    cost: jax.Array  # [T, N]
+    terminated: jax.Array  # [T, N] bool
+    truncated: jax.Array  # [T, N] bool
+    valid: jax.Array  # [T, N] bool
 
 
 Act = Callable[[jax.Array, jax.Array], jax.Array]  # obs [N, obs_dim], key -> action [N, action_dim]
 
 
 @full_precision
-def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Array) -> Episodes:
-    """Runs `num_episodes` episodes side by side from fresh resets to their ends."""
+def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Array) -> Trajectories:
+    """Runs `num_episodes` episodes side by side, each from a reset to its end.
+
+    Raises:
+        AssertionError: what the policy or the environment returns has another shape than it should.
+    """
     reset_key, key = jax.random.split(key)
     start = jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes))
 
-    def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple[State, jax.Array], Episodes]:
+    def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple[State, jax.Array], Trajectories]:
         state, running = carry
-        action = jax.vmap(functools.partial(executed, env))(policy(state.obs, key))
+        chosen = policy(state.obs, key)
+        chex.assert_shape(chosen, (num_episodes, env.action_dim))
+        action = jax.vmap(functools.partial(executed, env))(chosen)
         stepped = jax.vmap(env.step)(state, action)
-        episodes = Episodes(
+        check_step(env, stepped, num_episodes)
+        steps = Trajectories(
             obs=state.obs,
             action=action,
             reward=stepped.reward,
@@ -64,15 +73,16 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
             truncated=stepped.truncated,
             valid=running,
         )
-        return (stepped, running & ~stepped.done), episodes
+        return (stepped, running & ~stepped.done), steps
 
     running = jnp.ones(num_episodes, bool)
     keys = jax.random.split(key, env.max_episode_steps)
-    return jax.lax.scan(step, (start, running), keys)[1]
+    _, trajectories = jax.lax.scan(step, (start, running), keys)
+    return trajectories
 
 
-def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool) -> Act:
-    policy = networks.policy_of(config, env)
+def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool, policy: Policy | None) -> Act:
+    policy = networks.policy_of(config, env) if policy is None else policy
 
     def policy_act(obs: jax.Array, key: jax.Array) -> jax.Array:
         shape = (*obs.shape[:-1], env.action_dim)
@@ -91,15 +101,15 @@ def _uniform(env: Environment) -> Act:
     return policy_act
 
 
-def _totals(episodes: Episodes) -> Evaluation:
+def _totals(steps: Trajectories) -> Evaluation:
     return Evaluation(
-        episode_return=jnp.sum(jnp.where(episodes.valid, episodes.reward, 0.0), axis=0),
-        episode_cost=jnp.sum(jnp.where(episodes.valid, episodes.cost, 0.0), axis=0),
-        episode_length=jnp.sum(episodes.valid, axis=0),
+        episode_return=jnp.sum(jnp.where(steps.valid, steps.reward, 0.0), axis=0),
+        episode_cost=jnp.sum(jnp.where(steps.valid, steps.cost, 0.0), axis=0),
+        episode_length=jnp.sum(steps.valid, axis=0),
     )
 
 
-@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
+@jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose
 def evaluate(
     config: Config,
     actor: Actor,
@@ -109,38 +119,46 @@ def evaluate(
     seed: int = 0,
     deterministic: bool = False,
     draws: Sequence[int] | None = None,
+    policy: Policy | None = None,
 ) -> Evaluation:
-    """Return, cost and length of `num_episodes` fresh episodes for every seed of `actor` ([S]-leading).
+    """Return, cost and length of `num_episodes` new episodes of every policy in `actor`.
 
-    The policy acts stochastically, as it was trained, unless `deterministic`. The seeds are spread over the local
-    devices.
+    The S policies, one for each seed of a training, are spread over the local devices.
 
     Args:
-        config: of the policies.
-        actor: the policies, [S]-leading.
+        config: of the training.
+        actor: the policies, [S]-leading: `Result.actor`.
         env: the task, unbatched.
-        num_episodes: for each seed.
+        num_episodes: for each policy.
         seed: of all random numbers.
-        deterministic: whether the policies act with their modes.
-        draws: a number for each seed. Seeds with the same number play the same starts, layouts and noise, which makes
-            comparisons between their policies paired. None: 0 to S - 1, so that the seeds' means are independent.
+        deterministic: act with the mode of the policy's distribution, instead of stochastically as in training.
+        draws: one number for each policy. Policies with the same number play episodes with the same initial states,
+            layouts and noise, which makes comparisons between them paired. None stands for 0 to S - 1: then the means
+            of the policies are independent.
+        policy: the network that was given to `make_agent`; None for the method's own.
+
+    Returns:
+        NumPy arrays [S, num_episodes].
+
+    Raises:
+        ValueError: `num_episodes` is below 1.
     """
     if num_episodes < 1:
         raise ValueError(f"num_episodes {num_episodes}: must be at least 1")
-    keys = _keys(seed, range(len(jax.tree.leaves(actor)[0])) if draws is None else draws)
+    keys = _keys(seed, range(_num_rows(actor)) if draws is None else draws)
 
     def run(runs: tuple[Actor, jax.Array]) -> Evaluation:
         actor, key = runs
-        return _totals(run_episodes(env, _learnt(config, env, actor, deterministic), num_episodes, key))
+        return _totals(run_episodes(env, _learnt(config, env, actor, deterministic, policy), num_episodes, key))
 
     return jax.tree.map(np.asarray, _spread(run, (actor, keys)))
 
 
-@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
+@jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose
 def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) -> Evaluation:
-    """The same for uniformly random actions; arrays are [1, num_episodes]."""
+    """As `evaluate`, for the policy whose actions are uniformly random; the arrays are [1, num_episodes]."""
     num_devices = len(usable_devices())
-    padded = -(-num_episodes // num_devices) * num_devices  # so that the devices share them evenly
+    padded = -(-num_episodes // num_devices) * num_devices  # rounded up, so that each device has as many
 
     def run(key: jax.Array) -> Evaluation:
         return _totals(run_episodes(env, _uniform(env), 1, key))
@@ -149,20 +167,25 @@ def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) ->
 
 
 def _keys(seed: int, numbers: Sequence[int]) -> jax.Array:
-    """A random key for each number; it follows from the number and `seed` alone."""
+    """A random key for each number. It depends on the number and on `seed` alone, not on how many numbers there are."""
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
     return fold_in(jax.random.key(seed), jnp.asarray(numbers, jnp.uint32))
 
 
+def _num_rows(tree: PyTree) -> int:
+    """The length of the leading axis, which all leaves share."""
+    return len(jax.tree.leaves(tree)[0])
+
+
 def _spread(run: Callable[[Any], Any], runs: PyTree) -> Any:
-    """`run` of every row of `runs` ([R]-leading), the rows shared by the local devices."""
-    mesh = run_mesh(len(jax.tree.leaves(runs)[0]))
+    """`run` of every row of `runs` ([R]-leading), vmapped; the rows are divided among the local devices."""
+    mesh = run_mesh(_num_rows(runs))
     by_run = PartitionSpec("runs")
     shared = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=by_run, out_specs=by_run, check_vma=False)
     return jax.jit(shared)(jax.device_put(runs, NamedSharding(mesh, by_run)))
 
 
-@jax.transfer_guard("allow")  # what is set up and what comes back travels on purpose
+@jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose
 def record(
     config: Config,
     actor: Actor,
@@ -171,26 +194,40 @@ def record(
     num_episodes: int,
     seed: int = 0,
     metadata: dict[str, Any] | None = None,
+    policy: Policy | None = None,
 ) -> Demonstrations:
-    """Demonstrations of one policy (no seed axis), acting stochastically. Actions are recorded as executed."""
+    """Demonstrations of one policy, which acts stochastically.
+
+    Args:
+        config: of the training.
+        actor: the policy, without an axis of seeds.
+        env: the task, unbatched.
+        num_episodes: how many episodes to record.
+        seed: of all random numbers.
+        metadata: of the demonstrations.
+        policy: the network that was given to `make_agent`; None for the method's own.
+
+    Returns:
+        The episodes one after the other. Actions are recorded as executed: clipped to the environment's range.
+    """
 
     @jax.jit
-    def run(actor: Actor, key: jax.Array) -> Episodes:
-        return run_episodes(env, _learnt(config, env, actor, False), num_episodes, key)
+    def run(actor: Actor, key: jax.Array) -> Trajectories:
+        return run_episodes(env, _learnt(config, env, actor, False, policy), num_episodes, key)
 
-    episodes = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
-    keep = episodes.valid.T  # [N, T]: episode after episode
+    steps = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
+    keep = steps.valid.T  # [N, T]: one episode after the other
 
     def flat(x: np.ndarray) -> np.ndarray:
         return np.swapaxes(x, 0, 1)[keep]
 
     return Demonstrations(
-        obs=flat(episodes.obs).astype(np.float32),
-        actions=flat(episodes.action).astype(np.float32),
-        rewards=flat(episodes.reward).astype(np.float32),
-        costs=flat(episodes.cost).astype(np.float32),
-        terminated=flat(episodes.terminated),
-        truncated=flat(episodes.truncated),
+        obs=flat(steps.obs).astype(np.float32),
+        actions=flat(steps.action).astype(np.float32),
+        rewards=flat(steps.reward).astype(np.float32),
+        costs=flat(steps.cost).astype(np.float32),
+        terminated=flat(steps.terminated),
+        truncated=flat(steps.truncated),
         episode_ends=np.cumsum(keep.sum(axis=1)),
         metadata=metadata or {},
     )

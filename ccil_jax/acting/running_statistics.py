@@ -1,6 +1,6 @@
-"""Running mean and deviation of observations (Chan et al. 1983), for normalisation.
+"""Running mean and standard deviation of observations (Chan et al. 1983), to normalise what networks get.
 
-One object normalises for policy and critics; the discriminator keeps its own over learner and expert data.
+Policy and critics share one object. The discriminator has its own, over observations of the learner and of the expert.
 """
 
 import jax
@@ -8,25 +8,25 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-CLIP = 5.0  # authors: normalised observations are clipped to [-5, 5]
+CLIP = 5.0  # normalised observations are clipped to [-5, 5], as in the authors' code
 
 
 @struct.dataclass(kw_only=True)
 class RunningStatistics:
-    """Moments so far."""
+    """Moments of all samples so far."""
 
-    count: jax.Array  # []
+    count: jax.Array  # [] float: number of samples
     mean: jax.Array  # [D]
     sum_squares: jax.Array  # [D] of deviations from the mean
 
 
 def init(size: int) -> RunningStatistics:
-    """No samples yet: `normalize` only clips."""
+    """Statistics of no samples. With them, `normalize` clips and does nothing else."""
     return RunningStatistics(count=jnp.zeros(()), mean=jnp.zeros(size), sum_squares=jnp.zeros(size))
 
 
 def update(statistics: RunningStatistics, samples: Float[Array, "... D"]) -> RunningStatistics:
-    """Folds a batch in. Any leading axes."""
+    """The statistics with a batch of samples added, which may have any leading axes."""
     samples = samples.reshape(-1, samples.shape[-1])
     size = samples.shape[0]
     batch_mean = jnp.mean(samples, axis=0)
@@ -39,13 +39,16 @@ def update(statistics: RunningStatistics, samples: Float[Array, "... D"]) -> Run
 
 
 def std(statistics: RunningStatistics) -> Float[Array, " D"]:
-    """Population deviation; 1 before the first sample; at least 1e-2 so that a constant entry cannot explode."""
+    """Standard deviation over all samples; 1 before the first sample.
+
+    It is at least 1e-2, so that an entry that was constant so far cannot become huge when it changes.
+    """
     variance = statistics.sum_squares / jnp.maximum(statistics.count, 1.0)
     return jnp.where(statistics.count > 0, jnp.maximum(jnp.sqrt(variance), 1e-2), 1.0)
 
 
 def normalize(statistics: RunningStatistics | None, samples: Float[Array, "... D"]) -> Float[Array, "... D"]:
-    """Zero mean, unit deviation, clipped to [-5, 5]; samples as they are where there are no statistics."""
+    """(samples - mean) / std, clipped to [-5, 5]. Where there are no statistics (None), the samples as they are."""
     if statistics is None:
         return samples
     mean, deviation = (jnp.broadcast_to(x, samples.shape) for x in (statistics.mean, std(statistics)))

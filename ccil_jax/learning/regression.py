@@ -1,7 +1,8 @@
-"""Least-squares regression of critics on returns by minibatch Adam."""
+"""Least-squares regression of critics on returns, by minibatches and an optimiser of optax (Adam unless told)."""
 
 from collections.abc import Callable
 
+import chex
 import jax
 import jax.numpy as jnp
 import optax
@@ -15,38 +16,58 @@ from ccil_jax.types import PyTree
 
 @struct.dataclass(kw_only=True)
 class Critic:
-    """Parameters and optimiser of one value function, or of several with a leading axis."""
+    """One value function, or several with a leading axis."""
 
-    params: PyTree
-    optimizer: PyTree
+    params: PyTree  # of the network
+    optimizer: PyTree  # the optimiser's state
 
 
 def init(params: PyTree, learning_rate: Float[Array, ""] | float, optimizer: Optimizer = adam) -> Critic:
-    """A critic that has not been fitted."""
+    """A critic with these parameters, before its first fit."""
     return Critic(params=params, optimizer=optimizer(learning_rate).init(params))
 
 
 def fit(
     apply: Callable[[PyTree, jax.Array], jax.Array],
     critic: Critic,
-    obs: Float[Array, "M D"],
-    target: Float[Array, " M"],
+    obs: jax.Array,
+    target: jax.Array,
     key: jax.Array,
     *,
     learning_rate: Float[Array, ""] | float,
     num_epochs: int,
     minibatch_size: int,
     optimizer: Optimizer = adam,
-) -> tuple[Critic, Float[Array, ""]]:
-    """Minimises mean (apply(params, obs) - target)^2; every epoch is a fresh shuffle, its last partial batch dropped.
+) -> tuple[Critic, jax.Array]:
+    """Minimises the mean of (apply(params, obs) - target)^2 over the M samples.
+
+    Every epoch has a new random order. Its last minibatch is left out where it would not be full.
+
+    Args:
+        apply: the network, from parameters and observations [m, D] to values [m].
+        critic: where to begin.
+        obs: [M, D].
+        target: [M].
+        key: consumed.
+        learning_rate: of `optimizer`.
+        num_epochs: passes over the samples.
+        minibatch_size: samples of a gradient step.
+        optimizer: learning rate -> `optax.GradientTransformation`.
 
     Returns:
-        The fitted critic, and the mean loss over the last epoch.
+        The fitted critic, and the mean loss [] over the last epoch.
+
+    Raises:
+        AssertionError: the shapes do not fit, also that of what `apply` returns.
     """
+    chex.assert_rank(obs, 2)
+    chex.assert_shape(target, obs.shape[:1])
     rule = optimizer(learning_rate)
 
     def loss(params: PyTree, indices: jax.Array) -> jax.Array:
-        return jnp.mean((apply(params, obs[indices]) - target[indices]) ** 2)
+        predicted = apply(params, obs[indices])
+        chex.assert_shape(predicted, indices.shape)  # [m, 1] less [m] would be [m, m] without an error
+        return jnp.mean((predicted - target[indices]) ** 2)
 
     def descend(critic: Critic, indices: jax.Array) -> tuple[Critic, jax.Array]:
         value, gradient = jax.value_and_grad(loss)(critic.params, indices)
@@ -55,4 +76,5 @@ def fit(
 
     indices = minibatches(key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=num_epochs)
     critic, losses = jax.lax.scan(descend, critic, indices)
-    return critic, jnp.mean(losses.reshape(num_epochs, -1)[-1])
+    of_epochs = losses.reshape(num_epochs, -1)
+    return critic, jnp.mean(of_epochs[-1])

@@ -88,11 +88,9 @@ def train(
             anew where there is none. Without it, a folder that holds checkpoints is refused.
         moved: names of traced fields that may differ from those of the training that is resumed.
         verbose: show the progress on standard error: a live bar on a terminal, else a line about every ten seconds.
-        on_start: is called once, before the first iteration of this call, with the metrics of the iterations that were
-            done before ({} if there are none).
+        on_start: is called once, before the first iteration, with the metrics of iterations that were done earlier.
         on_progress: is called after every chunk of iterations.
-        should_stop: is asked after every chunk of iterations. Once it returns true, the state is saved and the result
-            so far is returned.
+        should_stop: is asked after every chunk. Once it returns true, the state is saved and the result returned.
         stop_after: stop once this many iterations are done in all, to be resumed later; 0 takes no step at all.
 
     Raises:

@@ -35,7 +35,7 @@ class Process:
         return float(np.sum(rho * self.cost))
 
     def flow(self) -> tuple[Array, Array]:
-        """M [S, S * A] and b [S] of the flow constraints M rho = b of an occupancy: what flows into a state flows out."""
+        """M [S, S * A] and b [S] of the flow constraints of an occupancy, M rho = b: what flows in flows out."""
         num_states, num_actions, _ = self.transition.shape
         out = np.repeat(np.eye(num_states), num_actions, axis=1)
         return out - self.gamma * self.transition.reshape(-1, num_states).T, (1 - self.gamma) * self.initial
