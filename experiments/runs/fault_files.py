@@ -1,4 +1,4 @@
-"""Diagnostic files: the state and key from which an iteration is not finite, to be replayed by `replay_fault`."""
+"""Diagnostic files: the state, with its random key, before an iteration that ended not finite; for `replay_fault`."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from ccil_jax.demonstrations import npz
 if TYPE_CHECKING:
     from ccil_jax.training.runner import Result
 
-_STATE = "state:"  # before the names of the state's leaves
+_STATE = "state:"  # stands before the names of the state's leaves
 
 
 def write(folder: Path, result: "Result", seed: int) -> Path:

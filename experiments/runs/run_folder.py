@@ -24,7 +24,7 @@ from experiments.cli.command_line import UsageError
 from experiments.runs.intervals import known_mean
 from experiments.runs.provenance import git_commit
 
-METRICS = (  # order of the columns; a method leaves out those that it lacks
+METRICS = (  # order of the columns of metrics.csv, which has those that the method reports
     "env_steps",
     "episode_return",
     "episode_cost",
@@ -64,7 +64,7 @@ _FACTS = frozenset(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes strict JSON, whole or not at all; numbers that are not finite become null."""
+    """Writes strict JSON: numbers that are not finite become null. The file is replaced as a whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     temporary.replace(path)
@@ -97,7 +97,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What config.json says."""
+    """The content of a run's config.json."""
 
     folder: Path
     config: Config
@@ -111,7 +111,15 @@ def read_run(folder: Path) -> Run:
 
 
 def parse_run(path: Path, facts: dict[str, Any]) -> Run:
-    """What the content of a config.json says; `path` is where it came from. Raises `UsageError`."""
+    """The run that the content of a config.json describes.
+
+    Args:
+        path: of the file that has the content; its folder is that of the run.
+        facts: the content; `config` is taken out of it.
+
+    Raises:
+        UsageError: a key is missing or unknown, or a value has a wrong type.
+    """
     fields = facts.pop("config", None)
     names = {f.name for f in dataclasses.fields(Config)}
     if not isinstance(fields, dict) or not _FACTS.issubset(facts):
@@ -152,7 +160,7 @@ def was_continued(run: Run, summary: Mapping[str, Any]) -> bool:
 
 
 def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:
-    """config.json: `facts` (task, physics, command, seeds, demonstrations, device), versions, and every field."""
+    """Writes config.json: `facts` (task, physics, command, seeds, ...), versions, commit, and all hyperparameters."""
     made_by = {"versions": versions(), "git_commit": git_commit()}
     content = {**facts, **made_by, "config": dataclasses.asdict(config)}
     write_json(folder / "config.json", content)
@@ -180,13 +188,13 @@ def read_metrics(folder: Path) -> dict[str, np.ndarray]:
 class MetricsWriter:
     """Writes metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager.
 
-    A value that is unknown (NaN) is an empty field of the file, and is left out of the events.
-    `begin` first: the file then holds exactly the iterations that the run goes on from, whatever a killed process left.
+    A value that is unknown (NaN) is an empty field of the file, and is left out of the events. Call `begin` first: it
+    replaces the rows of a process that was killed, some of which may be newer than its last checkpoint.
     """
 
     def __init__(self, folder: Path) -> None:
-        # Here: it imports protobuf, which no argument error should wait for. Not `SummaryWriter`: its thread dies of a
-        # full disk in silence, and the training waits for it for ever.
+        # Imported here because it imports protobuf, which is slow. It is not `SummaryWriter`, whose thread ends without
+        # a word when the disk is full, so that the training would wait for it for ever.
         from tensorboardX.event_file_writer import EventsWriter
 
         self.path = folder / "metrics.csv"
@@ -194,7 +202,7 @@ class MetricsWriter:
         self._names: list[str] = []
 
     def begin(self, history: Mapping[str, np.ndarray]) -> None:
-        """Replaces the file by the rows `[iterations, num_seeds]` of a checkpoint; none for a new run."""
+        """Writes the file anew with the rows `[iterations, num_seeds]` of a checkpoint; {} for a new run."""
         temporary = self.path.with_name(".metrics.csv.tmp")
         with temporary.open("w", newline="", encoding="utf-8") as file:
             if history:
@@ -202,7 +210,7 @@ class MetricsWriter:
         temporary.replace(self.path)
 
     def write(self, iteration: int, metrics: Mapping[str, np.ndarray]) -> None:
-        """Adds rows `[chunk, num_seeds]`; `iteration` is the number of iterations finished with the chunk's last."""
+        """Adds rows `[chunk, num_seeds]`; with the last of them `iteration` iterations are done."""
         with self.path.open("a", newline="", encoding="utf-8") as file:
             first = iteration - len(metrics["env_steps"])
             rows = self._append(file, metrics, first)
@@ -228,7 +236,7 @@ class MetricsWriter:
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
 
-        # Behaviour cloning takes no environment steps: its axis is the number of passes.
+        # Behaviour cloning takes no environment steps; its axis is the number of passes over the demonstrations.
         steps = int(row[0, self._names.index("env_steps")]) or iteration
         means = known_mean(row, axis=0)
         values = [
@@ -245,12 +253,12 @@ class MetricsWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        with contextlib.suppress(OSError):  # what `write` had to say of a full disk is said
+        with contextlib.suppress(OSError):  # `write` has already raised an error for a full disk
             self._events.close()
 
 
 def _text(value: float) -> str:
-    """Nine digits tell float32 numbers apart; counters are written in full, and nothing for what is unknown."""
+    """A number as text: nine digits, which tell all float32 numbers apart; integers in full; empty for NaN."""
     if math.isnan(value):
         return ""
     return str(int(value)) if value.is_integer() and abs(value) < 2**53 else f"{value:.9g}"
