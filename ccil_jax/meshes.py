@@ -8,18 +8,19 @@ from jax.sharding import AxisType
 
 
 def run_mesh(num_runs: int) -> jax.sharding.Mesh:
-    """The local devices that share the runs evenly: as many as divide their number."""
+    """A mesh of the most local devices that can share the runs evenly: their number divides that of the runs."""
     devices = usable_devices()
     size = max(n for n in range(1, len(devices) + 1) if num_runs % n == 0)
     return mesh_of(devices[:size])
 
 
 def usable_devices() -> list[jax.Device]:
-    """The local devices, but no more CPU devices than can wait for one another."""
+    """The local devices; of CPU devices at most one fewer than the threads that they share."""
     devices = jax.local_devices()
     if devices[0].platform == "cpu":
-        # A LAPACK kernel (MJX factorises with them) waits, in a thread of XLA's pool, for helpers from that pool: one
-        # thread must stay free, or all wait for ever. XLA reads the pool's size from this variable too.
+        # Every CPU device runs its program in a thread of a pool that they share. A LAPACK kernel in it (MJX factorises
+        # matrices with these) waits for helper threads from the same pool. So one thread must stay free, else all wait
+        # for ever. XLA reads the size of the pool from this variable, as is done here.
         num_threads = int(os.environ.get("PJRT_NPROC") or os.cpu_count() or 1)
         devices = devices[: max(1, num_threads - 1)]
     return devices

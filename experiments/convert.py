@@ -1,7 +1,7 @@
 """Converts demonstrations of another format to ours: `.npz` of baselines and CCIL, HDF5 of DSRL, a folder of Minari.
 
-The format is recognised by the content of the file. The file is not trusted: no code in it is run, and one that is
-damaged, inconsistent or of another task is refused with a one-line message.
+The format is recognised by the content of the file, or is one of your own, `--format`. The file is not trusted: no code
+in it is run, and one that is damaged, inconsistent or of another task is refused with a one-line message.
 """
 
 import argparse
@@ -10,7 +10,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ccil_jax.demonstrations import formats
 from ccil_jax.demonstrations.trajectories import Demonstrations, check_matches, load_demonstrations, save_demonstrations
+from ccil_jax.errors import UserError
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 
@@ -21,6 +23,12 @@ def make_parser() -> Parser:
     parser.add_argument("file", type=Path, metavar="FILE", help="demonstrations, or the folder of a Minari dataset")
     parser.add_argument(
         "--env", metavar="TASK", help="task of the demonstrations, whose dimensions must be those of the task"
+    )
+    parser.add_argument(
+        "--format",
+        metavar="MODULE:NAME",
+        help="read it as your own ccil_jax.Format, found as NAME in the Python module MODULE "
+        "(default: recognise the format)",
     )
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
@@ -42,7 +50,11 @@ def run(arguments: argparse.Namespace) -> None:
     command_line.check_new_file(out, "--out", overwrite=arguments.overwrite)
     if arguments.default_cost is not None and not 0 <= arguments.default_cost < float("inf"):
         raise UsageError(f"--default-cost {arguments.default_cost}: must be finite and not negative")
-    demonstrations = load_demonstrations(arguments.file, default_cost=arguments.default_cost)
+    try:
+        file_format = None if arguments.format is None else formats.named(arguments.format)
+    except UserError as error:
+        raise UsageError(f"--format {error}") from error
+    demonstrations = load_demonstrations(arguments.file, default_cost=arguments.default_cost, file_format=file_format)
     if arguments.default_cost not in (None, demonstrations.metadata.get("default_cost")):
         raise UsageError(
             f"--default-cost {arguments.default_cost:g}: {arguments.file} has costs of its own; leave it out"

@@ -72,9 +72,13 @@ class Column(Walk):
 
 def test_what_a_policy_or_an_environment_returns_must_have_the_right_shape() -> None:
     """A column in the place of numbers would be broadcast without an error."""
+
+    def zeros(width: int) -> evaluation.Act:
+        return lambda obs, key: jnp.zeros((len(obs), width))
+
     for env, width in ((Walk(), 3), (Column(), 1)):
         with pytest.raises(AssertionError, match="shape"):
-            evaluation.run_episodes(env, lambda obs, key, k=width: jnp.zeros((len(obs), k)), 2, jax.random.key(0))
+            evaluation.run_episodes(env, zeros(width), 2, jax.random.key(0))
     policy = networks.make_policy(CONFIG, Walk().obs_dim, 3)
     three = Actor(policy_params=policy.init(jax.random.key(1)), obs_statistics=None)
     for env, apply, params in (

@@ -4,6 +4,8 @@ import contextlib
 import errno
 import io
 import json
+import re
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,9 @@ import h5py
 import numpy as np
 import pytest
 
-from ccil_jax.demonstrations import hdf5, hdf5_child
+from ccil_jax.demonstrations import formats, hdf5, hdf5_child
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations, save_demonstrations
-from ccil_jax.errors import DemonstrationsError
+from ccil_jax.errors import DemonstrationsError, UserError
 from experiments import convert
 
 LENGTHS = (3, 4, 2)
@@ -437,3 +439,155 @@ def test_the_converter_answers_wrong_use_in_one_line(tmp_path: Path, capsys: pyt
         assert message in stderr
         assert stderr.count("\n") == 1
     assert not (tmp_path / "out.npz").exists()
+
+
+# Formats from outside ------------------------------------------------------------------------------------------------
+
+TABLES = '''
+"""A user's own format: a text file, whose lines are step, action and observation, cost, reward, and how it ended."""
+import numpy as np
+from ccil_jax import Format
+
+HEADER = "# swimmer steps"
+
+
+def read(path):
+    table = np.loadtxt(path, delimiter=",")
+    ended = table[:, 12].astype(int)
+    return {
+        "obs": table[:, 2:10],
+        "actions": table[:, :2],
+        "costs": table[:, 10:11],
+        "rewards": table[:, 11].tolist(),
+        "terminated": ended == 1,
+        "truncated": ended == 2,
+        "episode_ends": np.flatnonzero(ended) + 1,
+        "metadata": {"format": "tables"},
+    }
+
+
+def recognizes(path):
+    return path.is_file() and path.read_bytes().startswith(HEADER.encode())
+
+
+TABLES = Format(name="tables", recognizes=recognizes, read=read)
+NOT_A_FORMAT = 3
+'''
+
+
+def write_table(path: Path) -> Path:
+    ended = np.zeros(sum(LENGTHS))
+    ended[np.cumsum(LENGTHS) - 1] = [1, 2, 2]
+    columns = [*map(np.concatenate, (ACTIONS, OBS)), *(np.concatenate(x)[:, None] for x in (COSTS, REWARDS))]
+    np.savetxt(path, np.hstack([*columns, ended[:, None]]), delimiter=",", header="swimmer steps")
+    return path
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The text that names a user's format, whose module is in the current folder; the table is restored afterwards."""
+    (tmp_path / "own_tables.py").write_text(TABLES)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "own_tables", raising=False)
+    monkeypatch.setattr(formats, "FORMATS", [*formats.FORMATS])
+    return "own_tables:TABLES"
+
+
+def test_a_registered_format_is_recognised_and_read(outside: str, tmp_path: Path) -> None:
+    path = write_table(tmp_path / "steps.csv")
+    with pytest.raises(DemonstrationsError, match=r"not an \.npz archive"):
+        load_demonstrations(path)
+    own = formats.named(outside)
+    formats.register_format(own)
+    assert_arrived(path, flags=True)
+    assert load_demonstrations(path).metadata == {"format": "tables"}
+    assert_arrived(dsrl(tmp_path / "still.hdf5"), flags=True)
+    assert load_demonstrations(write_own(tmp_path, SOUND)).num_steps == 6
+    with pytest.raises(UserError, match="format 'tables': registered already; choose another name"):
+        formats.register_format(own)
+    for wrong in (None, read_text, formats.Format(name="", recognizes=own.recognizes, read=own.read)):
+        with pytest.raises(UserError, match=r"^register_format: .*give"):
+            formats.register_format(wrong)
+
+
+def test_a_registered_format_is_asked_before_our_own(outside: str, tmp_path: Path) -> None:
+    """An archive that ours would refuse, or read as something else."""
+    np.savez(tmp_path / "other.npz", swimmer=np.arange(3))
+    arrays = {**SOUND, "episode_ends": ENDS}
+    formats.register_format(
+        formats.Format(name="other", recognizes=lambda path: path.name == "other.npz", read=lambda path: arrays)
+    )
+    np.testing.assert_array_equal(load_demonstrations(tmp_path / "other.npz").costs, SOUND["costs"])
+    assert [known.name for known in formats.FORMATS] == ["other", "baselines", "hdf5", "minari", "ccil_jax"]
+
+
+def read_text(path: Path) -> Any:
+    return path.read_text()
+
+
+OWN_ARRAYS = {**SOUND, "episode_ends": ENDS}
+UNTRUSTED: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no mapping": (read_text, "the reader of format strange returned str; it must return the arrays by name"),
+    "no obs": (lambda path: {k: v for k, v in OWN_ARRAYS.items() if k != "obs"}, "returned no 'obs'; it must return"),
+    "unknown": (lambda path: {**OWN_ARRAYS, "acs": 1}, "returned the unknown 'acs'; it must return actions, episode_e"),
+    "metadata": (lambda path: {**OWN_ARRAYS, "metadata": "x"}, "returned metadata of type str; they must be a dict"),
+    "no costs": (lambda path: {**OWN_ARRAYS, "costs": None}, "holds no cost of each step; constrained methods need it"),
+    "NaN": (lambda path: {**OWN_ARRAYS, "costs": np.full(6, np.nan)}, "'costs' holds NaN or infinity"),
+    "negative": (lambda path: {**OWN_ARRAYS, "costs": -np.ones(6)}, "'costs' is negative"),
+    "rows differ": (lambda path: {**OWN_ARRAYS, "actions": np.ones((5, 2))}, "'actions' has 5 rows, 'obs' has 6"),
+    "two columns": (lambda path: {**OWN_ARRAYS, "costs": np.ones((6, 2))}, "'costs' has shape (6, 2)"),
+    "objects": (lambda path: {**OWN_ARRAYS, "obs": [None] * 6}, "'obs' has dtype object"),
+    "ragged": (lambda path: {**OWN_ARRAYS, "obs": [[1.0], [1.0, 2.0]]}, "'obs' cannot be turned into an array"),
+    "ends": (lambda path: {**OWN_ARRAYS, "episode_ends": [3, 7]}, "'episode_ends' covers 7 of 6 rows"),
+    "done inside": (lambda path: {**OWN_ARRAYS, "terminated": np.ones(6)}, "'terminated' is true before"),
+    "fails": (
+        lambda path: OWN_ARRAYS["acs"],
+        "format strange failed with KeyError: 'acs'; check the file, or the functions",
+    ),
+    "refuses": (Mock(side_effect=DemonstrationsError("steps.txt: line 3 is cut off")), "line 3 is cut off"),
+}
+
+
+@pytest.mark.parametrize("name", UNTRUSTED)
+def test_what_a_reader_from_outside_returns_is_not_trusted(name: str, outside: str, tmp_path: Path) -> None:
+    read, message = UNTRUSTED[name]
+    (tmp_path / "steps.txt").write_text("")
+    formats.register_format(formats.Format(name="strange", recognizes=lambda path: path.suffix == ".txt", read=read))
+    with pytest.raises(DemonstrationsError, match=re.escape(message)) as caught:
+        load_demonstrations(tmp_path / "steps.txt")
+    assert "steps.txt" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    if name == "no costs":
+        assert load_demonstrations(tmp_path / "steps.txt", default_cost=2.0).mean_episode_cost == 6.0
+
+
+def test_a_format_that_fails_to_recognise_is_named(outside: str, tmp_path: Path) -> None:
+    own = formats.Format(name="strange", recognizes=lambda path: path.read_text() == "", read=read_text)
+    formats.register_format(own)
+    with pytest.raises(DemonstrationsError, match="format strange failed with IsADirectoryError"):
+        load_demonstrations(tmp_path)
+
+
+def test_the_converter_reads_a_format_of_the_users(
+    outside: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is found in the current folder, and need not be registered."""
+    path, out = write_table(tmp_path / "steps.csv"), tmp_path / "out.npz"
+    with pytest.raises(SystemExit):
+        convert.main([str(path), "--env", "Swimmer", "--out", str(out)])
+    assert convert.main([str(path), "--env", "Swimmer", "--out", str(out), "--format", outside]) == 0
+    assert_arrived(out, flags=True)
+    capsys.readouterr()
+    for text, message in (
+        ("own_tables:MISSING", "--format own_tables:MISSING: module 'own_tables' has no attribute 'MISSING'"),
+        ("own_tables", "--format own_tables: not of the form module:attribute"),
+        ("own_tables:NOT_A_FORMAT", "--format own_tables:NOT_A_FORMAT: int is no ccil_jax.Format; give one"),
+        ("no_such_module_here:X", "--format no_such_module_here:X: there is no module 'no_such_module_here'"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            convert.main([str(path), "--env", "Swimmer", "--out", str(tmp_path / "x.npz"), "--format", text])
+        assert end.value.code == 2
+        stderr = capsys.readouterr().err
+        assert message in stderr
+        assert stderr.count("\n") == 1

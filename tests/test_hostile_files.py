@@ -64,7 +64,7 @@ def test_the_harness_sees_what_it_looks_for() -> None:
 import os, pickle, time
 from pathlib import Path
 import numpy as np
-from ccil_jax.demonstrations import DemonstrationsError
+from ccil_jax.errors import DemonstrationsError
 from tests import hostile_builders, hostile_files as h
 
 def refuse(): raise DemonstrationsError("no")

@@ -1,4 +1,4 @@
-"""HDF5 files from strangers, read by a child process: see `hdf5_child` beside this file for what is refused and why."""
+"""HDF5 files from strangers, read by a child process. `hdf5_child`, beside this file, says what is refused and why."""
 
 import contextlib
 import importlib.util
@@ -15,13 +15,15 @@ import numpy as np
 from ccil_jax.demonstrations import hdf5_child, npz
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-TIMEOUT = 300.0  # seconds
+TIMEOUT = 300.0  # seconds that the child process may take
 
 
 def read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays that demonstrations are made of, by their path inside the file.
+    """The datasets that demonstrations are made of, by their path inside the file.
 
-    Raises `ArchiveError`, also where the HDF5 library crashed, hung or took too much memory.
+    Raises:
+        ArchiveError: h5py is not installed, or the file is refused or damaged, also where the HDF5 library crashed on
+            it, did not end, or took too much memory.
     """
     if importlib.util.find_spec("h5py") is None:
         raise npz.ArchiveError(f"{path}: reading HDF5 needs h5py; install it with `pip install 'ccil_jax[hdf5]'`")
@@ -41,9 +43,12 @@ def read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _nameless_file(path: Path) -> tuple[BinaryIO, str, str]:
-    """A file for the child's arrays, gone once it is closed; where it is; and what to do if there is no room.
+    """A file without a name, for the child's arrays: it is gone once it is closed.
 
     It is in memory where the system has such files, so that no temporary folder is needed.
+
+    Returns:
+        The file, where it is, and what the user can do if there is no room for the arrays.
     """
     with contextlib.suppress(AttributeError, OSError):
         file = os.fdopen(os.memfd_create("arrays"), "w+b")
@@ -58,18 +63,22 @@ def _nameless_file(path: Path) -> tuple[BinaryIO, str, str]:
 
 
 def run_child(arguments: Sequence[str]) -> tuple[int, str]:
-    """Exit status and last words of `hdf5_child` in a fresh process. Raises `subprocess.TimeoutExpired`."""
+    """Runs `hdf5_child` in a new process. Raises `subprocess.TimeoutExpired`.
+
+    Returns:
+        The exit status, and the last line that it wrote to standard error.
+    """
     root = str(Path(__file__).parents[2])
     settings = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")])),
-        "HDF5_PLUGIN_PRELOAD": "::",  # no filter is loaded from disk, whatever the file asks for
+        "HDF5_PLUGIN_PRELOAD": "::",  # loads no filter from disk, even if the file asks for one: filters are code
         "OPENBLAS_NUM_THREADS": "1",  # its threads would count against the child's memory
     }
     command = [sys.executable, "-P", "-m", "ccil_jax.demonstrations.hdf5_child", *arguments]
     done = subprocess.run(
         command,
-        cwd=Path(root).anchor,  # not ours, where a stranger's module might be found
+        cwd=Path(root).anchor,  # not the current folder, where Python might find a stranger's module
         env=settings,
         stdin=subprocess.DEVNULL,
         capture_output=True,

@@ -1,7 +1,10 @@
-"""The process that reads one HDF5 file (argument 1) and writes what it holds as `.npz` to a descriptor (argument 2).
+"""A process that reads one HDF5 file and writes its known datasets as `.npz` to an open file descriptor.
 
-The HDF5 library is C and meets damaged files with crashes, endless loops and huge allocations; here they end a process
-that has nothing to lose. Links, external storage and virtual datasets, which make one file read another, are refused.
+Arguments: the file, the descriptor, and how many bytes the datasets may have.
+
+The HDF5 library is written in C. A damaged file can make it crash, loop without end or allocate huge amounts of memory.
+In a process of its own this does no harm: its limits end it, and the parent reports a damaged file. Links, external
+storage and virtual datasets are refused, because with them one file makes the library read another.
 """
 
 import contextlib
@@ -13,22 +16,22 @@ from typing import Any
 
 import numpy as np
 
-REFUSED, NOT_WRITTEN = 3, 4  # exit status: stderr holds one line that says why
+REFUSED, NOT_WRITTEN = 3, 4  # exit statuses; one line on standard error says why
 COST_KEYS = ("infos/cost", "infos/costs", "costs")  # where an episode of Minari may have its costs
 CPU_SECONDS = 120
 MAX_ENTRIES = 100_000
 _NAME = re.compile(
     r"(episode_\d{1,9}/)?(observations|actions|rewards|costs|terminals|timeouts|terminations|truncations|infos/costs?)"
 )
-_FILTERS = {1, 2, 3, 32000}  # deflate, shuffle, Fletcher's checksum, LZF: what h5py brings along
+_FILTERS = {1, 2, 3, 32000}  # those that h5py has built in: deflate, shuffle, Fletcher's checksum, LZF
 
 
 class RefusedError(Exception):
-    """One line: the entry and what is wrong with it."""
+    """The file is refused. The message is one line: the entry and what is wrong with it."""
 
 
 def extract(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
-    """The known datasets of `path`, `max_bytes` of them at most. Raises `RefusedError`."""
+    """The datasets of `path` whose names are known, `max_bytes` in all at most. Raises `RefusedError`."""
     import h5py
 
     with h5py.File(path, "r", locking=False) as file:
@@ -43,7 +46,10 @@ def extract(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
 
 
 def _datasets(file: Any) -> dict[str, Any]:
-    """The datasets whose names we know. What only shares the name of costs does not matter beside them."""
+    """The datasets whose names are known.
+
+    An entry that has a name of costs but is no array of numbers is left aside where its episode has other costs.
+    """
     entries = dict(_entries(file))
     complaints = {name: complaint for name, entry in entries.items() if (complaint := _no_array(entry))}
     arrays = {name: entry for name, entry in entries.items() if name not in complaints}
@@ -55,7 +61,7 @@ def _datasets(file: Any) -> dict[str, Any]:
 
 
 def _no_array(entry: Any) -> str | None:
-    """What keeps `entry` from being an array of numbers."""
+    """Why `entry` is no array of numbers; None if it is one."""
     import h5py
 
     if not isinstance(entry, h5py.Dataset):
@@ -66,7 +72,7 @@ def _no_array(entry: Any) -> str | None:
 
 
 def _entries(file: Any) -> Iterator[tuple[str, Any]]:
-    """What has a name that we know. Looks at a link before it follows it."""
+    """The entries whose names are known, by full name. A link is checked before it is followed."""
     for group in _groups(file):
         for name in group:
             full = f"{group.name}/{name}".strip("/")
@@ -76,7 +82,7 @@ def _entries(file: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _groups(file: Any) -> Iterator[Any]:
-    """The root, the episodes and their `infos`."""
+    """The groups in which datasets are looked for: the root, the episodes and their `infos`."""
     import h5py
 
     if len(file) > MAX_ENTRIES:
@@ -103,7 +109,7 @@ def _check_link(group: Any, name: str, full: str) -> None:
 
 
 def _check(name: str, dataset: Any, max_bytes: int) -> None:
-    """Everything that can be known of a dataset without reading its data."""
+    """Raises `RefusedError` for what can be seen to be wrong with a dataset before its data are read."""
     layout = dataset.id.get_create_plist()
     if dataset.is_virtual or layout.get_external_count():
         raise RefusedError(f"'{name}' is kept in other files, refused; copy the data in")
@@ -126,7 +132,7 @@ def _size(shape: Sequence[int]) -> int:
 
 
 def limit_resources(max_bytes: int) -> None:
-    """Memory, processor time and file size, so that the worst ends this process alone."""
+    """Limits this process's memory, processor time and size of files, so that a damaged file can only end it."""
     import resource
 
     for kind, amount in (
@@ -140,8 +146,12 @@ def limit_resources(max_bytes: int) -> None:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Reads file 0, writes to the open descriptor 1, argument 2 is the limit in bytes; returns the exit status."""
-    path, descriptor, max_bytes = Path(arguments[0]), int(arguments[1]), int(arguments[2])
+    """Reads the file `arguments[0]` and writes its datasets to the descriptor `arguments[1]`.
+
+    `arguments[2]` is how many bytes they may have. Returns the exit status.
+    """
+    file, descriptor_text, limit_text = arguments
+    path, descriptor, max_bytes = Path(file), int(descriptor_text), int(limit_text)
     limit_resources(max_bytes)
     try:
         arrays = extract(path, max_bytes)

@@ -1,6 +1,7 @@
-"""`.npz` archives from strangers: read without pickle, within a size limit, and written whole or not at all.
+"""`.npz` archives from strangers: read without pickle and within a limit on their size. Written whole or not at all.
 
-NumPy's own loader would run code hidden in object arrays if asked to, and believes headers that lie about their size.
+NumPy's own loader can be asked to read object arrays, and then runs any code that is hidden in them. It also believes
+what the header of an array says about its size, which can be more than the file holds, or more than there is memory.
 """
 
 import contextlib
@@ -22,9 +23,13 @@ import numpy as np
 from ccil_jax.errors import UserError
 
 MAX_BYTES = 2 * 1024**3  # of all arrays together, unpacked: a small archive can unpack to terabytes
+MAX_METADATA_BYTES = 1024**2  # of the text that describes the arrays
+SIGNATURE = b"PK"  # the first bytes of an archive
 
 _CHUNK = 1024**2
-ObjectReader = Callable[[bytes, tuple[int, ...], str], np.ndarray]  # pickle, declared shape, "file: 'key'" -> array
+ObjectReader = Callable[
+    [bytes, tuple[int, ...], str], np.ndarray
+]  # pickle, shape in the header, "file: 'key'" -> array
 
 _DAMAGE = (  # what a hostile archive can raise out of zipfile, zlib, struct, ast and NumPy
     ArithmeticError,
@@ -56,10 +61,17 @@ def read(
     remedy: str,
     read_objects: ObjectReader | None = None,
 ) -> dict[str, np.ndarray]:
-    """The arrays named `keys`, optional ones only where present. Runs no code and unpacks at most `MAX_BYTES`.
+    """The arrays of an archive. Runs no code in it, and unpacks at most `MAX_BYTES`.
 
-    Object arrays are refused unless `read_objects` reads their pickles. Raises `ArchiveError`; `remedy` ends the
-    messages about archives of a wrong kind.
+    Args:
+        path: of the archive.
+        keys: names of the arrays to read.
+        optional: those of the names that may be missing.
+        remedy: what to do about a file of another kind; ends such messages.
+        read_objects: reads the pickle of an object array; None refuses object arrays.
+
+    Raises:
+        ArchiveError: the file cannot be read, is damaged, or holds something else.
     """
     _check_kind(path, remedy)
     return read_open(path, str(path), keys, optional=optional, remedy=remedy, read_objects=read_objects)
@@ -74,7 +86,7 @@ def read_open(
     remedy: str,
     read_objects: ObjectReader | None = None,
 ) -> dict[str, np.ndarray]:
-    """As `read`, of an open file, or of one that is known to be an archive; the messages call it `name`."""
+    """As `read`, from an open file or from a path that is known to be an archive. The messages call it `name`."""
     arrays: dict[str, np.ndarray] = {}
     try:
         with zipfile.ZipFile(source) as archive:
@@ -97,8 +109,19 @@ def read_open(
     return arrays
 
 
+def starts_with(path: Path, signature: bytes) -> bool:
+    """Whether it is a file with these first bytes; false where it cannot be read."""
+    if not path.is_file():  # a pipe would be waited for
+        return False
+    try:
+        with path.open("rb") as file:
+            return file.read(len(signature)) == signature
+    except OSError:
+        return False
+
+
 def keys_of(source: Path | BinaryIO) -> frozenset[str]:
-    """Names of the arrays in an archive; none for what is no archive."""
+    """Names of the arrays in an archive; none where the file is no archive."""
     try:
         with zipfile.ZipFile(source) as archive:
             return frozenset(name.removesuffix(".npy") for name in archive.namelist())
@@ -107,7 +130,7 @@ def keys_of(source: Path | BinaryIO) -> frozenset[str]:
 
 
 def write(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes a compressed archive, whole or not at all; equal arrays give equal bytes. Raises `OSError`."""
+    """Writes a compressed archive, whole or not at all. Equal arrays give equal bytes. Raises `OSError`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".tmp")
     temporary = Path(name)
@@ -140,14 +163,14 @@ def _check_kind(path: Path, remedy: str) -> None:
         raise ArchiveError(f"{path}: a pickle, refused because it could execute code; {remedy}")
     if path.stat().st_size > MAX_BYTES:
         raise ArchiveError(f"{path}: larger than the limit of {MAX_BYTES} bytes; use fewer episodes")
-    if start != b"PK":
+    if start != SIGNATURE:
         raise ArchiveError(f"{path}: not an .npz archive; {remedy}")
 
 
 def _read_array(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, where: str, remedy: str, read_objects: ObjectReader | None
 ) -> np.ndarray:
-    """One member as an array, once its header has been found to agree with its size."""
+    """One member of the archive as an array, after checking that its header agrees with its size."""
     try:
         content = io.BytesIO(_unpack(archive, info))
         shape, fortran_order, dtype = _read_header(content)
@@ -164,9 +187,10 @@ def _read_array(
 
 
 def _unpack(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    """The member's bytes, never more than it declares: `ZipFile.read` unpacks all there is before it looks."""
+    """The member's bytes, at most one more than it declares. `ZipFile.read` unpacks all before it checks the size."""
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError("NumPy writes no other compression")  # and LZMA's header chooses how much memory it takes
+        # NumPy writes no other compression. LZMA could take any amount of memory, as its header says how much.
+        raise ValueError("not compressed as NumPy does it")
     with archive.open(info) as member:
         parts = []
         while part := member.read(min(_CHUNK, info.file_size + 1)):
@@ -179,7 +203,7 @@ def _read_header(content: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype[A
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError("not a version of the format")
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    with warnings.catch_warnings():  # about headers written by Python 2, and about odd literals in damaged ones
+    with warnings.catch_warnings():  # which NumPy gives about headers of Python 2, and Python about damaged headers
         warnings.simplefilter("ignore")
         return read_header(content)
 

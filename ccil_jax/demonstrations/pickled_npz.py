@@ -1,8 +1,10 @@
-"""The one restricted unpickler: `.npz` demonstrations of OpenAI's baselines and of CCIL, one array per trajectory.
+"""Reads the pickled arrays in `.npz` demonstrations of OpenAI's baselines and of CCIL, without running their code.
 
-Their object arrays are pickles, and a pickle is a program. Ours may use the opcodes and the five names that NumPy
-writes for arrays, dtypes and numbers. Opcodes are checked before any runs, and the names stand for classes of this file
-that keep what they are given: no function of NumPy's is called, and nothing grows beyond the bytes that the file holds.
+These files hold one array for each trajectory, in object arrays, which NumPy stores as pickles. A pickle is a program,
+and unpickling runs it. The unpickler here is restricted. It accepts only the opcodes and the five names that NumPy
+writes for arrays, dtypes and numbers. All opcodes are checked before the first one runs. The names stand for classes in
+this file which only keep what they are given, so that no function of NumPy is called. Nothing grows beyond the number
+of bytes that the file holds.
 """
 
 import io
@@ -20,7 +22,7 @@ from ccil_jax.demonstrations import npz
 
 KEYS = ("obs", "acs")
 OPTIONAL_KEYS = ("rews", "costs", "accucost")
-MAX_OPCODES = 3_000_000  # of a file: seconds of parsing; an array takes about 20, a boxed number 1 to 8
+MAX_OPCODES = 3_000_000  # of a file, which take seconds to parse. An array has about 20, a number in a list 1 to 8
 _OPCODES = frozenset(
     "PROTO FRAME STOP MARK MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD "
     "NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT EMPTY_LIST APPEND APPENDS "
@@ -44,11 +46,15 @@ _DAMAGE = (
 
 
 class _UnsafeError(Exception):
-    """A pickle asks for more than arrays."""
+    """A pickle has opcodes or names that arrays do not need."""
 
 
 def read(path: Path) -> dict[str, list[np.ndarray]]:
-    """For `KEYS`, and for `OPTIONAL_KEYS` where present, one numeric array per trajectory. Raises `ArchiveError`."""
+    """One numeric array for each trajectory, for each of `KEYS` and for those of `OPTIONAL_KEYS` that are there.
+
+    Raises:
+        ArchiveError: the file is damaged, or holds or does anything else.
+    """
     optional = frozenset(OPTIONAL_KEYS)
     remedy = "the keys are obs, acs, and costs or accucost"
     left = MAX_OPCODES
@@ -69,18 +75,20 @@ def read(path: Path) -> dict[str, list[np.ndarray]]:
 def unpickle(
     content: bytes, shape: tuple[int, ...], where: str, max_opcodes: int = MAX_OPCODES
 ) -> tuple[np.ndarray, int]:
-    """The object array in a pickle, and the opcodes that made it.
-
-    It is a numeric array, or one of object dtype [E] whose entries are numeric arrays.
+    """The array in a pickle.
 
     Args:
-        content: The pickle; only its first object is looked at.
-        shape: What the file's header declares.
-        where: File and key, which begin the message.
-        max_opcodes: How long the pickle may be.
+        content: the pickle; only its first object is looked at.
+        shape: of the array, as the file's header declares it.
+        where: file and key, which begin a message.
+        max_opcodes: how many opcodes the pickle may have.
+
+    Returns:
+        A numeric array, or an array [E] of dtype object whose entries are numeric arrays; and how many opcodes there
+        were.
 
     Raises:
-        ArchiveError: It is damaged, or holds or does anything else.
+        ArchiveError: the pickle is damaged, or holds or does anything else.
     """
     try:
         opcodes = _check_opcodes(content, max_opcodes)
@@ -98,9 +106,10 @@ def unpickle(
 
 
 def _check_opcodes(content: bytes, limit: int) -> int:
-    """Reads the program without running it: known opcodes, sizes that the file holds, a memo without gaps.
+    """Reads the pickle's program without running it, and returns the number of its opcodes.
 
-    Returns the number of opcodes.
+    All opcodes must be known ones, a frame no larger than the file, and the index of a memo entry no larger than the
+    number of opcodes before it, because the unpickler allocates a memo up to that index.
     """
     count = 0
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
@@ -119,7 +128,7 @@ def _check_opcodes(content: bytes, limit: int) -> int:
 
 
 class _Dtype:
-    """Stands for `numpy.dtype(code, align, copy)`."""
+    """In the place of `numpy.dtype(code, align, copy)`."""
 
     def __init__(self, code: str | bytes, *_: Any) -> None:
         self.code, self.order = _text(code), "|"
@@ -143,7 +152,7 @@ class _Dtype:
 
 
 class _Array:
-    """Stands for `numpy.ndarray`: `values` is a numeric array, or a list where the dtype is object."""
+    """In the place of `numpy.ndarray`: `values` is a numeric array, or a list where the dtype is object."""
 
     def __init__(self) -> None:
         self.shape: tuple[int, ...] = ()
@@ -166,7 +175,7 @@ class _Array:
 
 
 class _NdarrayName:
-    """Stands for the name `numpy.ndarray`, which is passed to `_reconstruct` and never called."""
+    """In the place of the name `numpy.ndarray`, which is passed to `_reconstruct` and is never called."""
 
 
 def _reconstruct(kind: type, *_: Any) -> _Array:
@@ -190,7 +199,7 @@ def _text(value: Any) -> str:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Knows the names that NumPy writes, as they stand in this file, and imports none."""
+    """Finds the names that NumPy writes in this file, and imports nothing."""
 
     def __init__(self, content: bytes) -> None:
         super().__init__(io.BytesIO(content), encoding="bytes")
@@ -218,7 +227,11 @@ class _Unpickler(pickle.Unpickler):
 
 
 class _Budget:
-    """A pickle may name one value many times. No honest number takes less than a byte, so that ends here."""
+    """How many numbers may still be made.
+
+    A pickle may refer to one value many times, so that a small file becomes a huge array. In a sound file every number
+    takes at least a byte. So more numbers than there are bytes raise a `ValueError`.
+    """
 
     def __init__(self, left: int) -> None:
         self._left = left

@@ -1,35 +1,24 @@
-"""Expert trajectories and their file format. NumPy only: launchers read files before JAX is imported.
+"""Expert trajectories: the container, and reading, checking and writing it.
 
-A file is an `.npz` archive without pickled objects: `obs [n, obs_dim]`, `actions [n, action_dim]`, `rewards [n]`
-(optional), `costs [n]`, `terminated [n]`, `truncated [n]`, `episode_ends [E]` and `metadata`, a JSON object as text.
-Other formats are read too: see `formats`, beside this file. Files come from strangers, so nothing in them is trusted:
-see `load_demonstrations`.
+Only NumPy is imported, because launchers read files before they import JAX. The formats of files are in `formats`,
+beside this file. Files come from strangers, so nothing in them is trusted: see `load_demonstrations`.
 """
 
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from ccil_jax.demonstrations import columns, formats, npz
+from ccil_jax.demonstrations.formats import Format
 from ccil_jax.errors import DemonstrationsError
 
-_FORMS: Mapping[str, Callable[[np.ndarray, str], np.ndarray]] = {
-    "obs": columns.rows,
-    "actions": columns.rows,
-    "rewards": columns.per_step,
-    "costs": columns.per_step,
-    "terminated": columns.flags,
-    "truncated": columns.flags,
-    "episode_ends": columns.indices,
-}
 _NUMBER_KEYS = ("obs", "actions", "rewards", "costs")
 _STEP_KEYS = (*_NUMBER_KEYS, "terminated", "truncated")
-_REWRITE = "write the file with ccil_jax.save_demonstrations"
 
 
 class TaskInfo(Protocol):
@@ -50,7 +39,7 @@ class TaskInfo(Protocol):
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Demonstrations:
-    """E episodes laid end to end in n steps; row t holds the observation in which action t was taken."""
+    """E episodes of n steps in all, one after the other. Row t holds the observation in which action t was taken."""
 
     obs: np.ndarray  # [n, obs_dim] float32
     actions: np.ndarray  # [n, action_dim] float32
@@ -58,22 +47,22 @@ class Demonstrations:
     costs: np.ndarray  # [n] float32, >= 0
     terminated: np.ndarray  # [n] bool: the task ended after this step
     truncated: np.ndarray  # [n] bool: the time limit was reached after this step
-    episode_ends: np.ndarray  # [E] int64: index one past each episode's last step
-    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # task, method, versions, command, ...
+    episode_ends: np.ndarray  # [E] int64: one more than the index of each episode's last step
+    metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # for example task, method, versions, command
 
     @property
     def num_steps(self) -> int:
-        """n: steps of all episodes together."""
+        """n, the number of steps of all episodes together."""
         return len(self.obs)
 
     @property
     def num_episodes(self) -> int:
-        """E."""
+        """E, the number of episodes."""
         return len(self.episode_ends)
 
     @property
     def episode_lengths(self) -> np.ndarray:
-        """[E] steps of each episode."""
+        """[E] the number of steps of each episode."""
         return np.diff(self.episode_ends, prepend=0)
 
     @property
@@ -88,23 +77,23 @@ class Demonstrations:
 
     @property
     def mean_episode_cost(self) -> float:
-        """J_E: what the learner's mean episode cost must not exceed (Algorithm 1 line 1)."""
+        """J_E, the mean cost of an episode: what that of the learner must not exceed (Algorithm 1 line 1)."""
         return float(np.mean(self.episode_costs))
 
     @property
     def mean_episode_return(self) -> float | None:
-        """R_E; None without rewards."""
+        """R_E, the mean return of an episode; None without rewards."""
         returns = self.episode_returns
         return None if returns is None else float(np.mean(returns))
 
     @property
     def cost_standard_error(self) -> float | None:
-        """How uncertain J_E is: its standard error over the episodes; None for a single one (docs/metrics.md)."""
+        """The standard error of J_E over the episodes; None for a single episode (docs/metrics.md)."""
         return standard_error(self.episode_costs)
 
     @property
     def return_standard_error(self) -> float | None:
-        """How uncertain R_E is: its standard error over the episodes; None for a single one, or without rewards."""
+        """The standard error of R_E over the episodes; None for a single episode, or without rewards."""
         returns = self.episode_returns
         return None if returns is None else standard_error(returns)
 
@@ -127,49 +116,57 @@ class Demonstrations:
 
 
 def standard_error(values: np.ndarray) -> float | None:
-    """The standard error of the mean of `values [n]`; None for fewer than two, whose spread is unknown."""
+    """The standard error of the mean of `values [n]`; None for fewer than two, from which it cannot be estimated."""
     return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
 
 
-def load_demonstrations(path: str | os.PathLike[str], *, default_cost: float | None = None) -> Demonstrations:
-    """Reads and checks demonstrations, ours or those of `ccil_jax.demonstrations.formats`, recognised by content.
+def load_demonstrations(
+    path: str | os.PathLike[str], *, default_cost: float | None = None, file_format: Format | None = None
+) -> Demonstrations:
+    """Reads and checks demonstrations of any format in `formats.FORMATS`, which is recognised by content.
 
-    Runs no code from the file and unpacks at most `npz.MAX_BYTES`. `default_cost` is taken for every step where a
-    file of another format has no costs, and the metadata say so; without it such a file is refused.
+    The package's own readers run no code from a file, and unpack at most `npz.MAX_BYTES`. Every value is checked,
+    whichever reader it comes from.
 
-    Raises `DemonstrationsError`, one line with file, key and remedy, for anything that is not a sound file.
+    Args:
+        path: a file, or the folder of a dataset.
+        default_cost: taken as the cost of every step where the file has no costs; the metadata say so then. Without
+            it, such a file is refused.
+        file_format: read the file as one of this format, whether it is recognised and registered or not.
+
+    Raises:
+        DemonstrationsError: this is no sound file. The message is one line with file, key and remedy.
     """
     path = Path(path)
-    try:
-        read = formats.reader_of(path)
-        arrays = _read_own(path) if read is None else read(path)
-    except npz.ArchiveError as error:
-        raise DemonstrationsError(str(error)) from None
+    chosen = formats.format_of(path) if file_format is None else file_format
+    arrays = formats.read(path, chosen)
     if arrays["costs"] is None:
         if default_cost is None:
-            raise DemonstrationsError(f"{path}: {formats.NO_COSTS}")
-        arrays["costs"] = np.full(len(arrays["obs"]), default_cost, np.float32)
+            where = f" ({chosen.costs})" if chosen.costs else ""
+            raise DemonstrationsError(
+                f"{path}: holds no cost of each step{where}; constrained methods need it (`convert --default-cost 0` "
+                "for gail)"
+            )
+        num_steps = len(_convert(arrays["obs"], "obs", str(path)))
+        arrays["costs"] = np.full(num_steps, default_cost, np.float32)
         arrays["metadata"] = {**arrays["metadata"], "default_cost": default_cost}  # nobody has measured these costs
     return _checked(arrays, str(path))
 
 
-def _read_own(path: Path) -> dict[str, Any]:
-    arrays: dict[str, Any] = {"rewards": None}
-    arrays.update(npz.read(path, (*_FORMS, "metadata"), optional=frozenset({"rewards"}), remedy=_REWRITE))
-    arrays["metadata"] = _parse_metadata(arrays["metadata"], path)
-    return arrays
-
-
 def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrations) -> None:
-    """Checks and writes a compressed `.npz`, whole or not at all; equal data give equal bytes.
+    """Checks the demonstrations and writes them to a compressed `.npz`, whole or not at all.
 
-    Raises `DemonstrationsError` for data that `load_demonstrations` would refuse, and `OSError` from the disk.
+    Equal demonstrations give equal bytes.
+
+    Raises:
+        DemonstrationsError: `load_demonstrations` would refuse the file.
+        OSError: the disk is full or cannot be written to.
     """
     path = Path(path)
     if path.suffix != ".npz":
         raise DemonstrationsError(f"{path}: a demonstrations file is named *.npz")
     checked = _checked({f.name: getattr(demonstrations, f.name) for f in dataclasses.fields(Demonstrations)}, str(path))
-    arrays = {key: value for key in _FORMS if (value := getattr(checked, key)) is not None}
+    arrays = {key: value for key in columns.FORMS if (value := getattr(checked, key)) is not None}
     try:
         text = json.dumps(checked.metadata, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -178,7 +175,10 @@ def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrat
 
 
 def check_matches(demonstrations: Demonstrations, path: str | os.PathLike[str], task: TaskInfo) -> None:
-    """Raises `DemonstrationsError` if the file `path` is of another task or of other dimensions than `task`."""
+    """Raises `DemonstrationsError` if the demonstrations from the file `path` are of another task than `task`.
+
+    That is, if they say so themselves, or if their observations or actions have other dimensions.
+    """
     recorded = demonstrations.metadata.get("task", task.name)
     if recorded != task.name:
         raise DemonstrationsError(
@@ -193,10 +193,11 @@ def check_matches(demonstrations: Demonstrations, path: str | os.PathLike[str], 
 
 
 def check_time_limit(demonstrations: Demonstrations, source: str | os.PathLike[str], max_episode_steps: int) -> None:
-    """Raises `DemonstrationsError`, which begins with `source`, if a trajectory is longer than the learner's episodes.
+    """Raises `DemonstrationsError` if a trajectory is longer than an episode of the learner can be.
 
-    The learner's cost limit is the mean cost of a demonstrated episode. An episode of the learner that is cut off
-    earlier has fewer steps in which to cost anything, so the constraint would never bind, and nothing would show that.
+    The learner's cost limit is the mean cost of a demonstrated episode. If the learner's episodes end earlier, there
+    are fewer steps at which a cost can arise, so the learner could keep the limit without any constraint, and nothing
+    would show this. `source` begins the message.
     """
     lengths = demonstrations.episode_lengths
     longest = int(np.argmax(lengths))
@@ -209,22 +210,9 @@ def check_time_limit(demonstrations: Demonstrations, source: str | os.PathLike[s
         )
 
 
-def _parse_metadata(array: np.ndarray, path: Path) -> dict[str, Any]:
-    try:
-        if array.nbytes > formats.MAX_METADATA_BYTES or (array.dtype != np.uint8 and array.ndim):
-            raise ValueError("not a text of reasonable length")
-        text = array.tobytes().decode() if array.dtype == np.uint8 else str(array.astype(np.str_)[()])
-        metadata = json.loads(text.removeprefix("\ufeff"))  # some editors begin a text with a byte order mark
-    except (ValueError, RecursionError):
-        metadata = None
-    if not isinstance(metadata, dict):
-        raise DemonstrationsError(f"{path}: 'metadata' is not a JSON object as text; {_REWRITE}")
-    return metadata
-
-
 def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
-    """The arrays, in their final types, as sound `Demonstrations`; `source` begins every complaint."""
-    known = [key for key in _FORMS if key != "rewards" or arrays[key] is not None]
+    """Demonstrations of these arrays, converted to their final types and checked; `source` begins every message."""
+    known = [key for key in columns.FORMS if key != "rewards" or arrays[key] is not None]
     converted: dict[str, Any] = {key: _convert(arrays[key], key, source) for key in known}
     num_steps = len(converted["obs"])
     if num_steps == 0:
@@ -241,11 +229,13 @@ def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
 
 
 def _convert(value: Any, key: str, source: str) -> np.ndarray:
-    """`value` in the form and the type that `key` has."""
+    """`value` as an array of the shape and the type that `Demonstrations` has under this key."""
     try:
-        array = _FORMS[key](np.asarray(value), f"{source}: '{key}'")
+        array = columns.FORMS[key](np.asarray(value), f"{source}: '{key}'")
     except npz.ArchiveError as error:
         raise DemonstrationsError(str(error)) from None
+    except (ValueError, TypeError):  # from NumPy
+        raise DemonstrationsError(f"{source}: '{key}' cannot be turned into an array of numbers; correct it") from None
     if key not in _NUMBER_KEYS:
         return array
     with np.errstate(over="ignore", invalid="ignore"):  # what does not fit float32 is reported as not finite

@@ -1,4 +1,4 @@
-"""Multipliers that no gradient ascends: the optimal one of a trust region, and a PID controller's."""
+"""Lagrange multipliers without gradient ascent: the optimal one of a trust region, and a PID controller's."""
 
 from typing import NamedTuple
 
@@ -11,23 +11,29 @@ from jaxtyping import Array, Float
 def optimal_weights(
     gram: Float[Array, "2 2"], gap: Float[Array, ""], max_kl: Float[Array, ""] | float
 ) -> Float[Array, " 2"]:
-    """Weights of [x_r, x_c] whose step, scaled to the radius, is that of constrained policy optimisation.
+    """Weights [w_r, w_c] with which w_r x_r + w_c x_c is the direction of constrained policy optimisation.
 
-    Achiam et al. (2017). The step s maximises g_r.s subject to gap + g_c.s <= 0 and s.F s / 2 <= max_kl. Its solution
-    lies on the radius (the objective is linear), so a direction is all there is to find: x_r - nu x_c with the
-    multiplier nu, from
+    In constrained policy optimisation (Achiam et al. 2017), the step d of the parameters solves
 
-        q = g_r.x_r, r = g_r.x_c, s = g_c.x_c,  A = q - r^2 / s,  B = 2 max_kl - gap^2 / s
+        maximise g_r.d  subject to  gap + g_c.d <= 0  and  d.F d / 2 <= max_kl
+
+    with the gradients g of reward and cost and the Fisher matrix F. The objective is linear, so the solution lies on
+    the boundary of the trust region, and only its direction is needed. That is x_r - nu x_c, with the natural
+    directions x = F^-1 g, and with the multiplier
+
+        nu = max(0, (r + sqrt(A / B) gap) / s),  A = q - r^2 / s,  B = 2 max_kl - gap^2 / s,
+        q = g_r.x_r,  r = g_r.x_c,  s = g_c.x_c
 
     Args:
         gram: [[q, r], [r, s]].
-        gap: by how much the surrogate of the cost, per step, exceeds its limit now.
-        max_kl: radius, nats.
+        gap: by how much the surrogate of the cost, per step, exceeds its limit before the step.
+        max_kl: radius of the trust region, nats.
 
     Returns:
-        [1, 0] where the plain step keeps the limit, or no step can change the cost; [1, -nu] where the limit binds;
-        [0, -1], the recovery, where no step within the radius reaches it, or above it where reward and cost rise along
-        the same line, so that nothing is left to gain.
+        [1, 0] if the step for the reward alone keeps the limit, or if no step changes the cost.
+        [1, -nu] if the limit binds.
+        [0, -1], which only lowers the cost, if it is above the limit and no step within the radius reaches the limit,
+        or if reward and cost rise along the same line, so that no reward can be gained without cost.
     """
     q, r, s = gram[0, 0], gram[0, 1], gram[1, 1]
     felt = s > jnp.finfo(gram.dtype).tiny
@@ -44,33 +50,34 @@ def optimal_weights(
 
 
 class Gains(NamedTuple):
-    """Of the controller; errors are relative to the limit, so that the gains suit all tasks."""
+    """The gains of the controller. Errors are relative to the limit, so the same gains suit tasks of any cost scale."""
 
     proportional: Float[Array, ""] | float
     integral: Float[Array, ""] | float
     derivative: Float[Array, ""] | float
-    smoothing: Float[Array, ""] | float  # share of the previous smoothed error that stays
+    smoothing: Float[Array, ""] | float  # beta in e = beta e_before + (1 - beta) error; 0 does not smooth
 
 
 @struct.dataclass(kw_only=True)
 class Pid:
     """The controller between two updates."""
 
-    multiplier: jax.Array  # [] its output
-    integral: jax.Array  # [] sum of errors times the gain, in [0, maximum]
-    error: jax.Array  # [] smoothed
+    multiplier: jax.Array  # [] the controller's output lambda
+    integral: jax.Array  # [] the sum of errors times the integral gain, in [0, maximum]
+    error: jax.Array  # [] the smoothed error e
 
 
 def pid_init(initial: Float[Array, ""] | float) -> Pid:
-    """Starts at the multiplier `initial`, as if it had been integrated."""
+    """The controller at the multiplier `initial`, which is the initial value of the integral."""
     start, zero = jnp.asarray(initial, jnp.result_type(float)), jnp.zeros(())
     return Pid(multiplier=start, integral=start, error=zero)
 
 
 def pid_step(state: Pid, error: Float[Array, ""], gains: Gains, maximum: Float[Array, ""] | float) -> Pid:
-    """lambda = max(0, kp e + ki sum(e) + kd max(0, de)) (Stooke et al. 2020), e smoothed.
+    """lambda = kp e + I + kd max(0, e - e_before), clipped to [0, maximum] (Stooke et al. 2020).
 
-    The integral is clipped to [0, maximum]: beyond, it would wind up and take as many updates to come back.
+    e is the smoothed error, and the integral I the sum of ki times the error, which is not smoothed. I is clipped to
+    [0, maximum] too: outside, it would go on to grow without effect, and take as many updates to come back (wind-up).
     """
     smoothed = gains.smoothing * state.error + (1 - gains.smoothing) * error
     integral = jnp.clip(state.integral + gains.integral * error, 0.0, maximum)

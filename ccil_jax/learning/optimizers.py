@@ -1,4 +1,4 @@
-"""Adam, as every part of the package that follows gradients uses it."""
+"""Adam, the optimiser of every part of the package that is trained by gradients, unless a user gives another."""
 
 from collections.abc import Callable
 
@@ -11,9 +11,10 @@ Optimizer = Callable[[Float[Array, ""] | float], optax.GradientTransformation]  
 
 
 def adam(learning_rate: Float[Array, ""] | float) -> optax.GradientTransformation:
-    """Optax's Adam, which also runs where JAX is told to refuse arithmetic between types (`numpy_dtype_promotion`).
+    """Optax's Adam, in a form that also works under JAX's strict mode for types (`numpy_dtype_promotion="strict"`).
 
-    Optax raises decay rates to the power of an integer counter, so its own code is traced under the usual rules.
+    Strict mode refuses arithmetic between floats and integers. Optax raises decay rates to the power of an integer
+    counter, so its update is traced under JAX's usual rules.
     """
     inner = optax.adam(learning_rate)
     return optax.GradientTransformation(inner.init, usual_rules(inner.update))

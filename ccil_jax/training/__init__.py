@@ -1,1 +1,1 @@
-"""From an agent to a finished run: the compiled program over seeds, its checkpoints, and the loop that logs."""
+"""From an agent to a finished run: the compiled program of all runs, the loop around it, and checkpoints."""

@@ -1,7 +1,8 @@
-"""Whole-state checkpoints that can be believed: the only module that knows orbax.
+"""Checkpoints of the whole state of a training, saved with orbax and verified. Only this module imports orbax.
 
-Orbax commits a step by renaming a folder, so that a killed process leaves none half-written. What it does not notice
-(flipped bits, other dtypes, a second writer, a disk that fills up behind its back) is what the manifests are for.
+Orbax writes a step to a temporary folder and renames it at the end, so that a process that is killed leaves no step
+that looks finished. It does not notice flipped bits, other dtypes, a second process that writes, or a disk that becomes
+full while it writes in the background. A manifest beside each step makes these visible: see `manifests`.
 """
 
 import contextlib
@@ -25,21 +26,25 @@ from ccil_jax.training.manifests import DamageError, Identity
 from ccil_jax.types import PyTree
 from envs.jax_tools import numbers
 
-KEPT = 2  # newest checkpoints that stay on disk
-_FREE = frozenset({"env_steps"})  # a finished run may be continued for longer
-_OVERHEAD = 2**20  # bytes of orbax's own files, at most
+KEPT = 2  # number of checkpoints that stay on disk: the newest
+_FREE = frozenset({"env_steps"})  # may always differ: a finished training may be continued for longer
+_OVERHEAD = 2**20  # bytes that orbax's own files take at most, besides the arrays
 
 _log = logging.getLogger(__name__)  # warnings go to stderr unless the program says otherwise
 
 
 class Checkpointer:
-    """Saves and restores one pytree per step under `directory`. Close it, or use it as a context manager.
+    """Saves and restores one pytree for each step under `directory`. Close it, or use it as a context manager.
 
     Args:
-        directory: made if need be. One writer at a time: hold its lock (`ccil_jax.training.filesystem`).
-        identity: of the training; a step of another is refused.
-        free: further fields in which the configurations may differ.
-        readonly: never touches what is there, so that a run can be read while it is written.
+        directory: made if need be. Only one process may write at a time, so hold a lock (`filesystem.hold`).
+        identity: of the training. A step of another training is refused. None compares nothing.
+        free: names of fields in which the configuration of a step may differ from that of `identity`, besides
+            `env_steps`.
+        readonly: change nothing on disk, so that checkpoints can be read while another process writes them.
+
+    Raises:
+        CheckpointError: checkpoints cannot be kept in this folder.
     """
 
     def __init__(
@@ -54,8 +59,9 @@ class Checkpointer:
         if complaint := unfit_for_checkpoints(self._directory):
             raise CheckpointError(f"{self._directory}: {complaint}")
         self._identity, self._free, self._readonly = identity, free | _FREE, readonly
-        handler = ocp.StandardCheckpointHandler()  # named, so that `structure` knows how to read an older run's files
-        with _warnings_of_orbax(logging.ERROR if readonly else logging.NOTSET):  # it warns of what was asked for
+        handler = ocp.StandardCheckpointHandler()  # orbax needs it to read the structure of what is there already
+        # Orbax warns that nothing will be saved, which is what `readonly` asks for.
+        with _warnings_of_orbax(logging.ERROR if readonly else logging.NOTSET):
             options = ocp.CheckpointManagerOptions(
                 max_to_keep=None if readonly else KEPT, create=not readonly, read_only=readonly
             )
@@ -68,12 +74,12 @@ class Checkpointer:
         self.close()
 
     def latest_step(self) -> int | None:
-        """The newest step that is finished and intact, or None if none was ever finished.
+        """The newest step that is finished and intact, or None if no step was ever finished.
 
-        What is newer is set aside with a warning that names it.
+        Newer steps, which are not finished or damaged, are renamed with a warning that names them.
 
         Raises:
-            CheckpointError: steps were finished, and every one of them is damaged.
+            CheckpointError: there are finished steps, and all of them are damaged.
         """
         damaged: DamageError | None = None
         passed = []
@@ -88,7 +94,7 @@ class Checkpointer:
                 continue
             good = step
             break
-        if good is None and len(passed) > 1:  # a kill leaves one unfinished step, no more
+        if good is None and len(passed) > 1:  # a process that is killed leaves one unfinished step: this is damage
             damaged = damaged or passed[0][1]
         if good is None and damaged is not None:
             raise CheckpointError(f"{damaged}; no other is intact: restore it from a copy, or begin a new run")
@@ -108,12 +114,12 @@ class Checkpointer:
         self._manager.reload()
 
     def check_identity(self, step: int) -> None:
-        """Raises `CheckpointError` where the step is of another training; only the manifest is read."""
+        """Raises `CheckpointError` if the step is of another training. Only its manifest is read."""
         folder = self._directory / str(step)
         manifests.check_identity(folder, manifests.read_manifest(folder), self._identity, self._free)
 
     def check_empty(self) -> None:
-        """Raises `CheckpointError` where there are steps already, which a new training would mix with its own."""
+        """Raises `CheckpointError` if there are steps already: a new training would mix its own with them."""
         if steps := sorted(self._manager.all_steps()):
             raise CheckpointError(
                 f"{self._directory}: holds checkpoints already (steps {', '.join(map(str, steps))}); resume that "
@@ -121,9 +127,10 @@ class Checkpointer:
             )
 
     def replace(self, step: int, state: PyTree) -> None:
-        """Saves as `save` does what another training may have saved here before.
+        """Saves as `save` does, also where another training has saved steps before.
 
-        A step that holds the same arrays stays as it is; all others are set aside as `N.replaced`, `N.replaced-2`, ...
+        If the step is there already with the same arrays, nothing is done. Else all steps that are there are renamed to
+        `N.replaced`, `N.replaced-2`, ..., and the step is saved.
         """
         folder = self._directory / str(step)
         with contextlib.suppress(DamageError):
@@ -134,10 +141,11 @@ class Checkpointer:
         self.save(step, state)
 
     def save(self, step: int, state: PyTree) -> None:
-        """Saves, and proves that it is on disk.
+        """Saves `state` as `step`, and waits until it is on disk with its manifest.
 
         Raises:
-            CheckpointError: the disk is full or fails, or the step is there already: what is saved is never replaced.
+            CheckpointError: the disk is full or fails; or this step, or a later one, is there already: what is saved is
+                never replaced.
         """
         needed = sum(numbers(leaf).nbytes for leaf in jax.tree.leaves(state)) + _OVERHEAD
         free = shutil.disk_usage(self._directory).free
@@ -148,18 +156,18 @@ class Checkpointer:
             raise CheckpointError(self._no_space(folder, needed, free))
         try:
             saved = self._manager.save(step, args=ocp.args.StandardSave(state))
-            # Waiting costs little and tells of a failure now, not one save later.
+            # Waiting costs little. Without it, orbax would report a failure only at the next save.
             self._manager.wait_until_finished()
             if saved:
                 manifests.write(folder, state, self._identity)
-        except (OSError, ValueError, RuntimeError) as error:  # TensorStore reports the system's errors as ValueError
+        except (OSError, ValueError, RuntimeError) as error:  # TensorStore raises ValueError for errors of the system
             if _is_disk_error(error):
                 free = shutil.disk_usage(self._directory).free
                 raise CheckpointError(self._no_space(folder, needed, free)) from error
             raise CheckpointError(
                 f"{folder}: cannot be written ({_first_line(error)}); see to the disk and resume"
             ) from error
-        if not saved:  # orbax says no in silence
+        if not saved:  # orbax raises no error for a step that is older than the newest
             raise CheckpointError(
                 f"{folder}: not saved, as {self._directory} holds a later step; choose another folder"
             )
@@ -172,10 +180,14 @@ class Checkpointer:
         )
 
     def restore(self, step: int, like: PyTree) -> PyTree:
-        """The state saved at `step`; `like` gives structure, shapes, dtypes and shardings.
+        """The state that was saved at `step`.
+
+        Args:
+            step: one that `latest_step` has returned.
+            like: the structure of the state, with the shape, dtype and sharding of each leaf.
 
         Raises:
-            CheckpointError: what was saved is something else, or damaged.
+            CheckpointError: what was saved has another structure, is of another training, or is damaged.
         """
         folder = self._directory / str(step)
         manifest = manifests.read(folder)
@@ -189,12 +201,12 @@ class Checkpointer:
         return state
 
     def structure(self, step: int) -> PyTree:
-        """What was saved at `step`, as empty NumPy arrays of its shapes and dtypes."""
+        """The structure of what was saved at `step`: NumPy arrays of its shapes and dtypes, with arbitrary values."""
         metadata = self._manager.item_metadata(step)
         return jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), metadata)
 
     def close(self) -> None:
-        """Frees the manager's threads. No save is in flight."""
+        """Ends orbax's threads. There is nothing to wait for, because `save` has waited already."""
         self._manager.close()
 
 

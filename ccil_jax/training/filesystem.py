@@ -1,4 +1,4 @@
-"""Files and folders: who writes, what was written, and that the disk is full."""
+"""Files and folders: locks, digests, and the errors of a full disk."""
 
 import contextlib
 import errno
@@ -11,13 +11,13 @@ from pathlib import Path
 
 from ccil_jax.errors import LockedError
 
-DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # or a quota, or the largest file that may be
+DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # also: a quota is used up, or a file may not be so large
 
 
 def unfit_for_checkpoints(path: Path) -> str | None:
-    """What is wrong with a folder below which checkpoints are to be kept; None if nothing is.
+    """Why checkpoints cannot be kept in `path`; None if they can.
 
-    Orbax takes a path with [ for a pattern, and commits a step whose arrays are not there.
+    Orbax takes a [ in a path as part of a pattern, and then reports a finished step whose arrays are not there.
     """
     if "[" not in str(path.resolve()):
         return None
@@ -26,9 +26,16 @@ def unfit_for_checkpoints(path: Path) -> str | None:
 
 @contextlib.contextmanager
 def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
-    """Holds the lock file `path`, which stays behind, unlocked. If it is held, raises `LockedError` at once, or waits.
+    """Locks the file `path` for this process while the context lasts. The file stays there afterwards, unlocked.
 
     The operating system frees the lock when the process ends, however it ends.
+
+    Args:
+        path: made if need be, with its folder.
+        wait: wait until another process frees the lock, instead of raising an error.
+
+    Raises:
+        LockedError: another process holds the lock.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a+", encoding="utf-8") as file:
@@ -47,6 +54,6 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def file_sha256(path: Path) -> str:
-    """Digest of a file's bytes, hexadecimal."""
+    """The SHA-256 digest of a file's bytes, hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

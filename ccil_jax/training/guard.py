@@ -1,6 +1,7 @@
-"""Numbers that go wrong: an iteration that is not finite does not happen, and a seed that cannot recover stops.
+"""Protection against NaN and infinity: an iteration that yields them is taken back; a seed with many of them stops.
 
-A wrapper around an agent's step. Seeds are vmapped from outside, so what befalls one leaves the others' bits alone.
+This is a wrapper around an agent's functions for one seed. The seeds are vmapped around the wrapper, so a fault of one
+seed does not change the bits of the others.
 """
 
 from typing import Any
@@ -14,17 +15,18 @@ from ccil_jax.agents.base import Agent
 from ccil_jax.types import Metrics, PyTree
 from envs.jax_tools import compute_where, is_key
 
-# An engine's own state may hold infinities (MJX marks absent contacts so). What of it matters shows in the observation.
+# The field of an environment's state that may hold infinities: with MJX they mark contacts that are not there. A fault
+# in it that matters shows in the observation.
 UNCHECKED = "physics"
 
 
 @struct.dataclass(kw_only=True)
 class GuardedState:
-    """An agent's state with its faults counted."""
+    """An agent's state, and how many iterations were taken back."""
 
-    agent: Any
-    skipped: jax.Array  # [] int32: iterations that were not finite, so far
-    skipped_in_a_row: jax.Array  # [] int32: of them, those since the last finite one; at the limit the seed has stopped
+    agent: Any  # the agent's own state
+    skipped: jax.Array  # [] int32: number of iterations taken back so far
+    skipped_in_a_row: jax.Array  # [] int32: number of them since the last sound one; at the limit the seed has stopped
 
     @property
     def actor(self) -> Actor:
@@ -33,12 +35,19 @@ class GuardedState:
 
 
 def protect(agent: Agent, max_skipped: int) -> Agent:
-    """The same agent, with every step that is not finite taken back.
+    """The same agent, but every step that is not sound is taken back.
 
-    A step is not finite where a metric is not, or where a number of the state was finite before and is not after.
-    Taken back means that everything is as before, bit for bit, but the random keys: the next step rolls other episodes.
-    After `max_skipped` such steps in a row the seed stops in the state, with the key, that leads to the last of them:
-    `agent.step` replays the fault. The metric `skipped_updates` counts them.
+    A step is sound if all its metrics are finite, and every number of the state that was finite before is so after.
+    Taking a step back restores the state from before it, bit for bit, except for the random keys: with those from after
+    the step, the next step draws other episodes, and may be sound.
+
+    After `max_skipped` steps in a row that were taken back, the seed stops. Its state, with the random keys, is the one
+    from before the last of these steps, so `agent.step` of it repeats the fault. The metric `skipped_updates` counts
+    the steps that were taken back.
+
+    Args:
+        agent: of one seed; vmap the result.
+        max_skipped: at this many steps in a row the seed stops.
     """
 
     def init(key: jax.Array) -> GuardedState:
@@ -57,7 +66,8 @@ def protect(agent: Agent, max_skipped: int) -> Agent:
             keys = jax.tree.map(lambda before, after: after if is_key(before) else before, old, new)
             return jax.tree.map(lambda a, b: jnp.where(in_a_row < max_skipped, a, b), keys, old)
 
-        # Almost never needed, so nothing is copied; and a step that no code follows rounds as it does unguarded.
+        # `compute_where` computes nothing while every seed is sound, which is nearly always. It also keeps XLA from
+        # fusing the selection below into the step: fused, the step would round differently from an unguarded one.
         held = compute_where(~(alive & ok), take_back, new, old, new)
         skipped = state.skipped + fault.astype(jnp.int32)
         guarded = GuardedState(agent=held, skipped=skipped, skipped_in_a_row=in_a_row)
@@ -73,7 +83,7 @@ def all_finite(tree: PyTree) -> jax.Array:
 
 
 def stays_finite(before: PyTree, after: PyTree) -> jax.Array:
-    """[] bool: whether every number that was finite still is, an engine's own state aside."""
+    """[] bool: whether every number that was finite before is so after; `UNCHECKED` fields are left aside."""
 
     def stays(path: tuple[Any, ...], before: jax.Array, after: jax.Array) -> jax.Array:
         if not _is_float(before) or any(getattr(entry, "name", None) == UNCHECKED for entry in path):
@@ -85,12 +95,12 @@ def stays_finite(before: PyTree, after: PyTree) -> jax.Array:
 
 
 def stopped(state: GuardedState, max_skipped: int) -> jax.Array:
-    """[S] bool: the seeds that have stopped, of an [S]-leading state."""
+    """[S] bool: which seeds have stopped, in the state of S seeds."""
     return state.skipped_in_a_row >= max_skipped
 
 
 def not_finite(tree: PyTree) -> list[str]:
-    """Names of the leaves that hold NaN or infinity."""
+    """The names of the leaves of a tree that hold NaN or infinity."""
     found = jax.tree_util.tree_leaves_with_path(tree)
     return [
         jax.tree_util.keystr(path, simple=True, separator=".")

@@ -1,17 +1,20 @@
-"""Metrics of a run, iteration by iteration, as NumPy arrays: what of them is known."""
+"""Metrics of a training as NumPy arrays, one row for each iteration, and which of them are known."""
 
 from collections.abc import Mapping
 
 import numpy as np
 
-EPISODE_ESTIMATES = ("episode_return", "episode_cost", "episode_length")  # metrics of whole episodes
+EPISODE_ESTIMATES = ("episode_return", "episode_cost", "episode_length")  # metrics of whole, finished episodes
 
 
 def without_unknown(history: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The metrics [iterations, runs], with NaN for what is said of episodes before a run's first episode has ended.
+    """The metrics with NaN for the estimates of episodes until a run's first whole episode has ended.
 
-    The learner's own estimates then stand at a start value, which nobody has measured. An iteration that was taken back
-    ends no episode. Metrics of a method that does not act are returned as they are.
+    Before that, an estimate of the learner is only its initial value, which was not measured. Episodes of an iteration
+    that was taken back do not count. Metrics of a method that does not act are returned as they are.
+
+    Args:
+        history: metrics [iterations, num_runs], by name.
     """
     if "episodes_finished" not in history:
         return dict(history)

@@ -1,6 +1,7 @@
-"""Manifests of checkpoints: what was saved, down to the SHA-256 of every array and of every file.
+"""Manifests of checkpoints: which training was saved, and the SHA-256 digest of every array and of every file.
 
-A manifest is written last, whole or not at all: a step without one was not finished.
+The manifest of a step is written after everything else, and appears whole or not at all. So a step without a manifest
+was not finished, and a step that disagrees with its manifest is damaged.
 """
 
 import dataclasses
@@ -28,11 +29,11 @@ NAME = "manifest.json"
 
 
 class DamageError(CheckpointError):
-    """A checkpoint that is not what was written."""
+    """A checkpoint that is not as it was written, or was not finished."""
 
 
 def describe(tree: PyTree) -> dict[str, dict[str, Any]]:
-    """`{name: {dtype, shape, sha256}}` of every leaf; shapes alone where leaves have no values."""
+    """`{name: {dtype, shape, sha256}}` of every leaf; without `sha256` where a leaf has no values."""
     found = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): _describe(leaf) for path, leaf in found}
 
@@ -47,23 +48,23 @@ def _describe(leaf: Any) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Identity:
-    """Which training a checkpoint is of. What is None is not known, and is not compared.
+    """Which training a checkpoint is of. A field that is None is not known, and is not compared.
 
-    Its runs are [len(configs) * num_seeds]: configuration after configuration, each with its seeds in turn.
+    The training has [len(configs) * num_seeds] runs: all seeds of the first configuration, then all of the second, ...
     """
 
     configs: tuple[Config, ...]  # resolved
     num_seeds: int | None = None  # of each configuration
-    seed: int | None = None  # of their keys
+    seed: int | None = None  # from which the random keys of the seeds are made
     task: str | None = None
     max_episode_steps: int | None = None
-    demonstrations: str | None = None  # SHA-256 of what is learnt from; "none" where the method does not imitate
+    demonstrations: str | None = None  # `demonstrations_sha256`; "none" where the method does not imitate
 
 
 def identity_of(
     configs: Sequence[Config], env: Environment, demonstrations: Demonstrations | None, num_seeds: int, seed: int
 ) -> Identity:
-    """The identity of a training of resolved configurations."""
+    """The identity of a training of these configurations, which must be resolved."""
     learnt_from = demonstrations if configs[0].row.imitates else None
     return Identity(
         configs=tuple(configs),
@@ -76,7 +77,7 @@ def identity_of(
 
 
 def demonstrations_sha256(demonstrations: Demonstrations) -> str:
-    """Digest of every array that a learner sees, whatever file they came from."""
+    """The SHA-256 digest of all arrays that a learner uses. It does not depend on the file that they came from."""
     digest = hashlib.sha256()
     for name in ("obs", "actions", "costs", "terminated", "truncated", "episode_ends"):
         array = np.ascontiguousarray(getattr(demonstrations, name))
@@ -86,7 +87,7 @@ def demonstrations_sha256(demonstrations: Demonstrations) -> str:
 
 
 def write(folder: Path, state: PyTree, identity: Identity | None) -> None:
-    """Completes the step in `folder`, whose files hold `state`."""
+    """Writes the manifest of the step in `folder`, whose files hold `state`. With it the step is finished."""
     content = {
         "identity": None if identity is None else _plain(dataclasses.asdict(identity)),
         "versions": versions(),
@@ -103,7 +104,7 @@ def write(folder: Path, state: PyTree, identity: Identity | None) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a step, whose other files are not looked at. Raises `DamageError` if it is not intact."""
+    """The manifest of a step. No other file is read. Raises `DamageError` if the manifest is missing or damaged."""
     path = folder / NAME
     try:
         content = json.loads(path.read_bytes())
@@ -117,7 +118,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """The manifest of an intact step: every file is there and as it was written. Raises `DamageError`."""
+    """The manifest of a step, after checking that every file is there and as it was written. Raises `DamageError`."""
     content = read_manifest(folder)
     present = {str(file.relative_to(folder)): file for file in _files(folder)}
     for name, expected in content["files"].items():
@@ -131,7 +132,10 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def check_identity(folder: Path, manifest: Mapping[str, Any], identity: Identity | None, free: frozenset[str]) -> None:
-    """Raises `CheckpointError` where `identity` is not the manifest's, but for the fields `free` of configurations."""
+    """Raises `CheckpointError` if the step is of another training than `identity`.
+
+    Fields of configurations that are in `free`, or that the method does not use, may differ.
+    """
     saved = manifest.get("identity") or _identity_of_older(manifest)
     if identity is None or saved is None:
         return
@@ -148,7 +152,7 @@ def check_identity(folder: Path, manifest: Mapping[str, Any], identity: Identity
 
 
 def _identity_of_older(manifest: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What a manifest of version 0.1.0 before identities says: its first configuration."""
+    """The identity in a manifest of early versions, which held only the first configuration."""
     return {"configs": [manifest["config"]]} if manifest.get("config") else None
 
 
@@ -160,7 +164,10 @@ def _other(folder: Path, name: str, saved: Any, now: Any) -> CheckpointError:
 
 
 def check_arrays(folder: Path, manifest: Mapping[str, Any], tree: PyTree) -> None:
-    """Raises `CheckpointError` where an array's dtype or shape is not the manifest's, `DamageError` for its values."""
+    """Raises `CheckpointError` if an array of `tree` has another dtype or shape than the manifest says.
+
+    Raises `DamageError` if it has other values.
+    """
     saved, now = manifest["arrays"], describe(tree)
     for name in sorted(saved.keys() | now.keys()):
         for fact in ("dtype", "shape"):
@@ -184,6 +191,6 @@ def _sha256(content: Mapping[str, Any]) -> str:
 
 
 def _plain(value: dict[str, Any]) -> dict[str, Any]:
-    """As it comes back from JSON: lists for tuples, Python's numbers for NumPy's."""
+    """`value` as it would be read back from JSON: with lists for tuples, and Python's numbers for NumPy's."""
     plain: dict[str, Any] = json.loads(json.dumps(value, default=operator.methodcaller("item")))
     return plain

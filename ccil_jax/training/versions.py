@@ -1,4 +1,4 @@
-"""Versions of Python, of this package and of those that a result depends on."""
+"""The versions of Python, of this package, and of the packages that results depend on."""
 
 import importlib.metadata
 import platform
@@ -9,7 +9,7 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mu
 
 
 def versions() -> dict[str, str]:
-    """Version of Python, of this package and of each other one that is installed, by name."""
+    """The versions of Python, of this package, and of those other packages that are installed, by name."""
     found = {"python": platform.python_version(), "ccil_jax": __version__}
     for name in _PACKAGES:
         try:
