@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import save_demonstrations
 from envs.registry import TaskInfo
 from experiments.cli import command_line, xla
 from experiments.cli.command_line import Parser, UsageError
 from experiments.policies import evaluating
 from experiments.policies.evaluating import Loaded, Settings
+from experiments.policies.numpy_policy import is_known
 from experiments.runs import evaluations, recording, run_folder, summary
 from experiments.runs.run_folder import Run
 
@@ -98,6 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     evaluations.read(path)
     if arguments.simulator == "original":
         check_original(task)
+    check_policy(arguments, stored.config)
     files = check_files(arguments, path)
     described = describe_recording(arguments, stored)
     for option, file in files:
@@ -127,6 +130,18 @@ def check_original(task: TaskInfo) -> None:
         )
     if task.original is None or task.original_package is None:
         raise UsageError(f"--simulator original: task {task.name} has no original in gymnasium; leave it out")
+
+
+def check_policy(arguments: argparse.Namespace, config: Config) -> None:
+    """Raises `UsageError` where a policy of the user's own would have to be computed in NumPy."""
+    if is_known(config):
+        return
+    reason = f"method {config.method} has a policy of its own, which only JAX can compute"
+    if arguments.simulator == "original":
+        raise UsageError(f"--simulator original: {reason}; leave it out")
+    for file in arguments.export:
+        if file.suffix == ".npz":
+            raise UsageError(f"--export {file}: {reason}; give a file named *.stablehlo")
 
 
 def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Path]]:

@@ -11,6 +11,7 @@ import numpy as np
 from ccil_jax.config import relevant
 from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number
 from experiments.page.entries import Entry, choose_seed
+from experiments.policies.numpy_policy import is_known
 from experiments.runs.intervals import bootstrap_interval
 
 _COLUMNS = (
@@ -235,9 +236,10 @@ def _text(value: str) -> str:
 def animate(entry: Entry) -> str:
     """The HTML of an episode of the seed with the highest return.
 
-    It is empty for a run without checkpoints, and for a task that cannot be drawn or is not known here.
+    It is empty for a run without checkpoints, for a task that cannot be drawn or is not known here, and for a policy
+    of the user's own.
     """
-    if not (entry.run.folder / "checkpoints").is_dir() or entry.view is None:
+    if not (entry.run.folder / "checkpoints").is_dir() or entry.view is None or not is_known(entry.run.config):
         return ""
     from experiments.page import animation  # imports JAX, which a page without episodes does not need
 

@@ -18,6 +18,11 @@ _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+def is_known(config: Config) -> bool:
+    """Whether this file can compute the policy of a method: it is one of this package, not one of the user's own."""
+    return config.row.policy in ("gaussian", "squashed")
+
+
 class NumpyPolicy:
     """The forward pass of the policy of one seed, in float64.
 

@@ -12,6 +12,7 @@ from ccil_jax.training.progress import Display
 from experiments.cli import xla
 from experiments.cli.interruption import Interruption
 from experiments.runs import fault_files, run_folder, summary
+from experiments.runs.metrics_file import read_metrics
 from experiments.runs.plans import ProgramPlan, RunPlan, Setup
 from experiments.runs.run_log import RunLog, write_config
 
@@ -194,7 +195,7 @@ def _finish(
     reference = summary.make_reference(
         summary.expert_levels(setup.demonstrations), random, plan.config.prescribed_limit
     )
-    metrics = run_folder.read_metrics(plan.folder)
+    metrics = read_metrics(plan.folder)
     rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
     content = {

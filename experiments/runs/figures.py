@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from experiments.runs import run_folder
 from experiments.runs.intervals import known_deviation, known_mean
 from experiments.runs.labels import literal
+from experiments.runs.metrics_file import read_metrics
 
 PANELS = (
     ("episode_return", "Return"),
@@ -75,7 +76,7 @@ def read_curve(folder: Path, label: str | None = None) -> Curve:
     cost, length = run.facts["expert_cost"], run.facts["expert_length"]
     return Curve(
         label=label or run.config.method,
-        metrics=run_folder.read_metrics(folder),
+        metrics=read_metrics(folder),
         expert_levels={
             "episode_return": run.facts["expert_return"],
             "episode_cost": cost,

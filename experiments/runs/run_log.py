@@ -8,6 +8,7 @@ from ccil_jax.config import Config
 from ccil_jax.training.filesystem import file_sha256
 from experiments.cli import options
 from experiments.runs import run_folder, summary
+from experiments.runs.metrics_file import MetricsWriter
 from experiments.runs.plans import RunPlan
 
 if TYPE_CHECKING:
@@ -29,9 +30,7 @@ class RunLog:
     ) -> None:
         self._steps_per_iteration = config.steps_per_iteration
         self._plans, self._env = [plan for plan, _ in runs], env
-        self._writers = [
-            (stack.enter_context(run_folder.MetricsWriter(plan.folder)), columns) for plan, columns in runs
-        ]
+        self._writers = [(stack.enter_context(MetricsWriter(plan.folder)), columns) for plan, columns in runs]
         self._steps = self._seconds = 0.0
 
     def begin(self, history: "History") -> None:

@@ -11,6 +11,7 @@ from ccil_jax.config import Config
 from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number, show
 from experiments.runs import run_folder
 from experiments.runs.intervals import bootstrap_interval
+from experiments.runs.metrics_file import read_metrics
 from experiments.runs.summary import NO_INTERVAL
 from experiments.sweeps.variants import Variant
 
@@ -37,7 +38,7 @@ def row(variant: Variant) -> Row:
                 seed.get(f"{name}_standard_error") for seed in summary["per_seed"]
             ]
     content["violation_beyond_error"] = summary.get("violation_beyond_error")  # earlier versions do not say
-    metrics = run_folder.read_metrics(variant.plan.folder)
+    metrics = read_metrics(variant.plan.folder)
     limit = summary["expert_cost"] if summary["cost_limit"] is None else summary["cost_limit"]
     content |= multiplier_path(variant.plan.config, metrics, limit)
     rate, num_runs = summary["env_steps_per_second"], summary["runs_in_program"]
