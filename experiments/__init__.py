@@ -1,7 +1,7 @@
 """Launchers: `ccil NAME --help`, or `python -m experiments.NAME --help`.
 
-`python -m` looks into the current directory first, where a package of somebody else may hide one that launchers need.
-This file looks whether that has happened to `ccil_jax`, and `ccil_jax` whether it has happened to `envs`.
+`python -m` looks for packages in the current folder first. A folder there that happens to be called `ccil_jax` would be
+imported instead of ours. This file checks that this has not happened; `ccil_jax` checks the same of `envs`.
 """
 
 import importlib.util

@@ -1,8 +1,9 @@
-"""Trains variants of MALM and CVAG that differ in one choice, and says what each choice is worth.
+"""Trains variants of a method that differ in one choice, and compares their results and speeds.
 
-Choices that are numbers inside the program share one compilation; the baselines and every other choice have a program
-of their own, as many runs each, so that their speeds compare. A question's first variant is its baseline: what the
-preset `paper` has, from which all start unless another is given.
+Each question compares several answers; the first one is the baseline. All variants start from the preset `paper` unless
+another one is given, so that the baseline is what that preset has. Variants that differ only in numbers inside the
+compiled program are trained together in one program. Each baseline and each other variant has a program of its own,
+with equally many runs, so that their speeds can be compared.
 """
 
 import argparse
@@ -26,7 +27,7 @@ from experiments.sweeps.variants import Variant, make_variant
 
 @dataclasses.dataclass(frozen=True)
 class Question:
-    """One choice: what to ask, of which method, and the changes of `Config` behind each answer, baseline first."""
+    """One choice of a method: the question, and the changes of `Config` that each answer makes, the baseline first."""
 
     text: str
     method: str
@@ -38,7 +39,7 @@ def _one_field(text: str, field: str, values: Sequence[Any], method: str = "malm
 
 
 def _preset(name: str, method: str) -> dict[str, Any]:
-    """What a preset says of the fields that the method uses."""
+    """The values that a preset has for fields which the method uses."""
     idle = unused(Config.from_preset(name, method=method))
     return {field: value for field, value in PRESETS[name].items() if field not in idle}
 
@@ -120,7 +121,16 @@ def make_parser() -> Parser:
 
 
 def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tuple[str, str], Variant]:
-    """The variant behind each (question, answer); the same variant where two answers come to the same `Config`."""
+    """The variant of each (question, answer). Answers that lead to the same `Config` have the same variant.
+
+    Args:
+        names: of the questions.
+        shared: options of `train` that all variants have.
+        out: folder of the whole study.
+
+    Raises:
+        UserError: an option is wrong, or makes no difference to any of the variants.
+    """
     found: dict[str, Variant] = {}
     answers = {}
     fields = {"preset": "paper", **shared}
@@ -136,7 +146,7 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
         folder = _name(plain, changes)
         baseline = answer == next(iter(question.answers))
         if folder not in found or (baseline and not found[folder].alone):
-            # What all variants share may make no difference to some of them.
+            # An option that makes a difference to one variant may make none to another, which would refuse it.
             own = {field: value for field, value in fields.items() if field not in idle[name, answer]}
             options_of_variant = {**own, "method": question.method, **changes}
             found[folder] = make_variant(folder, options_of_variant, out, load=load, alone=baseline)
@@ -145,7 +155,7 @@ def ask(names: Sequence[str], shared: Mapping[str, Any], out: Path) -> dict[tupl
 
 
 def _config(fields: Mapping[str, Any], changes: Mapping[str, Any], method: str) -> Config:
-    """The configuration of an answer; what makes no difference to it is left at its default."""
+    """The configuration of an answer. Fields that make no difference to it have their default values."""
     given = {name: value for name, value in fields.items() if name in options.CONFIG_FIELDS}
     return Config.from_base({**PRESETS[fields["preset"]], **given, **changes, "method": method}, {})
 
@@ -169,7 +179,10 @@ def rows_of(answers: Mapping[tuple[str, str], Variant]) -> list[Row]:
 
 
 def _relative_speed(row: Row, baseline: Row | None) -> float | None:
-    """None where it would mean nothing: programs of different numbers of runs, or one that was only resumed."""
+    """Steps per second relative to the baseline.
+
+    None where the two cannot be compared: their programs had different numbers of runs, or one took no new step.
+    """
     if baseline is None or row["runs_in_program"] != baseline["runs_in_program"]:
         return None
     rates = row["env_steps_per_second"], baseline["env_steps_per_second"]
@@ -177,7 +190,10 @@ def _relative_speed(row: Row, baseline: Row | None) -> float | None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Trains what is missing, then writes ablations.csv and ablations.png; status 1 if a program failed."""
+    """Trains what is missing, then writes ablations.csv and ablations.png.
+
+    Returns the exit status, 1 if a program failed.
+    """
     own = ("questions", *dispatch.option_names())
     shared = {name: value for name, value in vars(arguments).items() if name not in own}
     task = options.find_task(shared.get("env"))

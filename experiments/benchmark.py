@@ -1,7 +1,8 @@
-"""Measures physics, rollouts, whole training and the meta-gradient, and prints a table with their ratios.
+"""Measures the speeds of physics, rollouts, whole training and the meta-gradient, and prints a table with their ratios.
 
-Every row runs in a process of its own (so that peak memory is that row's); within a row the measurements are taken in
-turn, and medians are reported, so that other work on the machine spoils a round rather than a ratio.
+Every row is measured in a process of its own, so that the peak memory is that of the row. Within a row, the kinds of
+measurement take turns, for several rounds, and medians over the rounds are reported: when other work slows the machine
+down for a while, it slows all kinds of one round, and the ratios stay right.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import run_folder
 from experiments.speed import peers, row_processes, tables
 
-_LEAST_STEPS = 16  # of each simulation in a batch
+_LEAST_STEPS = 16  # least number of steps of each simulation in a batch, unless --batch-size says otherwise
 
 
 def make_parser() -> Parser:
@@ -49,8 +50,8 @@ def make_parser() -> Parser:
         "--batch-size",
         type=positive,
         metavar="K",
-        help="steps per batch, whose minibatches grow with it (default: the preset's, or the next multiple of N, or 16 "
-        "steps of each simulation, whichever is more)",
+        help="steps per batch; minibatches grow with it (default: the preset's, but at least 16 steps of each "
+        "simulation, rounded up to a multiple of N)",
     )
     parser.add_argument(
         "--jobs",
@@ -69,15 +70,15 @@ def make_parser() -> Parser:
         "--peers",
         type=Path,
         metavar="DIR",
-        help="instead: compare with other packages, whose environments are in DIR (docs/performance.md)",
+        help="compare with other packages instead, whose virtual environments are in DIR (docs/performance.md)",
     )
-    parser.add_argument("--profile", action="store_true", help="instead: where the time of an iteration goes")
+    parser.add_argument("--profile", action="store_true", help="measure instead where the time of an iteration goes")
     parser.add_argument("--row", help=argparse.SUPPRESS)  # a setting as JSON: measure it here and print the result
     return parser
 
 
 def settings_of(arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    """One setting (see `measuring.Setting`) per row. Raises `UsageError` or `ConfigError` for wrong input."""
+    """The fields of one `setting.Setting` per row. Raises `UsageError` or `ConfigError` for wrong input."""
     changes = {}
     for num_envs in arguments.num_envs:
         changes[num_envs] = _batch(arguments.preset, num_envs, arguments.batch_size)
@@ -111,7 +112,7 @@ def _find_task(name: str) -> TaskInfo:
 
 
 def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]:
-    """Changes to the preset, so that `num_envs` simulations fill its batch or, where they are many, a larger one."""
+    """Changes of the preset with which `num_envs` simulations fill a batch; the minibatches grow with the batch."""
     config = Config(**PRESETS[preset])
     if batch_size is None:
         least = max(config.batch_size, _LEAST_STEPS * num_envs)
@@ -122,7 +123,7 @@ def _batch(preset: str, num_envs: int, batch_size: int | None) -> dict[str, int]
 
 
 def _beside(setting: dict[str, Any], peer: peers.Peer, num_seeds: int) -> dict[str, Any]:
-    """The row of ours that does a peer's work: its task and method, and batches of 2000 steps as there."""
+    """The setting of ours that does the same work as a peer: its task and method, and its batches of 2000 steps."""
     changes = {"batch_size": 2000}
     return {**setting, "task": peer.task, "method": peer.method, "num_seeds": num_seeds, "changes": changes}
 
@@ -152,9 +153,10 @@ def _measure_here(text: str, *, profile: bool) -> None:
     """In a row's own process: measures the setting in `text` and prints the row."""
     setting = row_processes.begin_row(text)
     from experiments.speed import measuring, profiling  # import JAX
+    from experiments.speed.setting import Setting
 
     measure = profiling.profile if profile else measuring.measure
-    print(json.dumps(measure(measuring.Setting(**setting))))
+    print(json.dumps(measure(Setting(**setting))))
 
 
 def _compare(pythons: Mapping[str, Path], setting: dict[str, Any], out: Path, facts: Mapping[str, Any]) -> None:

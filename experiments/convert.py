@@ -1,7 +1,7 @@
-"""Turns demonstrations of another format into ours: baselines and CCIL `.npz`, DSRL's HDF5, a Minari folder.
+"""Converts demonstrations of another format to ours: `.npz` of baselines and CCIL, HDF5 of DSRL, a folder of Minari.
 
-The format is recognised by content, or is one of your own, `--format`. The file is read as one from a stranger: no code
-in it runs, and what is damaged, inconsistent or of another task ends in one line.
+The format is recognised by the content of the file, or is one of your own, `--format`. The file is not trusted: no code
+in it is run, and one that is damaged, inconsistent or of another task is refused with a one-line message.
 """
 
 import argparse
@@ -21,7 +21,9 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("convert", __doc__ or "")
     parser.add_argument("file", type=Path, metavar="FILE", help="demonstrations, or the folder of a Minari dataset")
-    parser.add_argument("--env", metavar="TASK", help="task that they are of; their dimensions must be its own")
+    parser.add_argument(
+        "--env", metavar="TASK", help="task of the demonstrations, whose dimensions must be those of the task"
+    )
     parser.add_argument(
         "--format",
         metavar="MODULE:NAME",
@@ -40,7 +42,7 @@ def make_parser() -> Parser:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Checks, converts and says what was written."""
+    """Checks everything, converts the file and prints what was written."""
     task = options.find_task(arguments.env)
     out: Path = arguments.out
     if out.suffix != ".npz":

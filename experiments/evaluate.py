@@ -1,8 +1,8 @@
 """Evaluates every seed of a trained run: return and cost over fresh episodes, in our simulator or the original one.
 
-The result file keeps earlier evaluations: the newest in each simulator stands first, those before it under `earlier`.
-With --record, one seed's policy is recorded as demonstrations too, as `expert` does; with --export, all seeds' policies
-are written for other programs.
+The result file keeps all evaluations: the newest of each simulator under the simulator's name, older ones under
+`earlier`. With --record, the policy of one seed is also recorded as demonstrations, as `expert` does it. With --export,
+the policies of all seeds are also written to files that other programs can use.
 """
 
 import argparse
@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import save_demonstrations
 from envs.registry import TaskInfo
 from experiments.cli import command_line, xla
 from experiments.cli.command_line import Parser, UsageError
 from experiments.policies import evaluating
 from experiments.policies.evaluating import Loaded, Settings
+from experiments.policies.numpy_policy import is_known
 from experiments.runs import evaluations, recording, run_folder, summary
 from experiments.runs.run_folder import Run
 
@@ -28,7 +30,7 @@ def make_parser() -> Parser:
     parser = Parser("evaluate", __doc__ or "")
     parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder that `train` or `expert` wrote")
     parser.add_argument(
-        "--episodes", default=50, type=command_line.positive, metavar="N", help="per seed (default: 50)"
+        "--episodes", default=50, type=command_line.positive, metavar="N", help="episodes per seed (default: 50)"
     )
     parser.add_argument(
         "--simulator",
@@ -36,14 +38,16 @@ def make_parser() -> Parser:
         choices=evaluations.SIMULATORS,
         help="ours, or gymnasium's own -v5 environments (one process, NumPy) (default: ours)",
     )
-    parser.add_argument("--deterministic", action="store_true", help="act with the mode instead of sampling")
+    parser.add_argument(
+        "--deterministic", action="store_true", help="act with the mode of the policy instead of sampling"
+    )
     parser.add_argument(
         "--seed", default=1, type=command_line.natural, metavar="N", help="of the episodes (default: 1)"
     )
     parser.add_argument(
         "--shared-episodes",
         action="store_true",
-        help="all seeds play the same starts, layouts and noise, for paired comparisons (default: each its own)",
+        help="all seeds play the same starts, layouts and noise, for paired comparisons (default: each seed its own)",
     )
     parser.add_argument(
         "--export",
@@ -51,22 +55,27 @@ def make_parser() -> Parser:
         default=[],
         type=Path,
         metavar="FILE",
-        help="also write the policies: with these episodes as NumPy arrays (.npz), or as a program (.stablehlo)",
+        help="also write the policies of all seeds: as NumPy arrays, together with the results of these episodes "
+        "(.npz), or as a StableHLO program (.stablehlo)",
     )
     parser.add_argument(
         "--record",
         type=Path,
         metavar="FILE.npz",
-        help="also record demonstrations of one seed's policy, in our simulator and sampling its actions",
+        help="also record demonstrations by the policy of one seed, in our simulator and with sampled actions",
     )
     parser.add_argument(
         "--seed-index",
         type=command_line.natural,
         metavar="N",
-        help="the seed to record (default: that of the highest return within the cost limit, as `expert` chooses)",
+        help="the seed to record (default: as `expert` chooses, the one with the highest return among those within the "
+        "cost limit)",
     )
     parser.add_argument(
-        "--num-trajectories", type=command_line.positive, metavar="K", help=f"to record (default: {_NUM_TRAJECTORIES})"
+        "--num-trajectories",
+        type=command_line.positive,
+        metavar="K",
+        help=f"episodes to record (default: {_NUM_TRAJECTORIES})",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace existing files of --export and --record")
     parser.add_argument(
@@ -79,7 +88,7 @@ def make_parser() -> Parser:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Checks, evaluates, writes and prints."""
+    """Checks everything, plays the episodes, writes the results and prints them."""
     if not arguments.run.is_dir():
         raise UsageError(f"RUN_DIR {arguments.run}: no such folder; give a folder that `train` wrote")
     stored = run_folder.read_run(arguments.run)
@@ -91,6 +100,7 @@ def run(arguments: argparse.Namespace) -> None:
     evaluations.read(path)
     if arguments.simulator == "original":
         check_original(task)
+    check_policy(arguments, stored.config)
     files = check_files(arguments, path)
     described = describe_recording(arguments, stored)
     for option, file in files:
@@ -122,10 +132,23 @@ def check_original(task: TaskInfo) -> None:
         raise UsageError(f"--simulator original: task {task.name} has no original in gymnasium; leave it out")
 
 
-def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Path]]:
-    """The files that are to be written, `path` among them, each with its option.
+def check_policy(arguments: argparse.Namespace, config: Config) -> None:
+    """Raises `UsageError` where a policy of the user's own would have to be computed in NumPy."""
+    if is_known(config):
+        return
+    reason = f"method {config.method} has a policy of its own, which only JAX can compute"
+    if arguments.simulator == "original":
+        raise UsageError(f"--simulator original: {reason}; leave it out")
+    for file in arguments.export:
+        if file.suffix == ".npz":
+            raise UsageError(f"--export {file}: {reason}; give a file named *.stablehlo")
 
-    Raises `UsageError` where one has an unknown form, or would replace another.
+
+def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Path]]:
+    """The files that are to be written, each with its option: the result file `path`, then --export and --record.
+
+    Raises:
+        UsageError: a file's name has an unknown ending, or the file would replace another.
     """
     for file in arguments.export:
         if file.suffix not in (".npz", ".stablehlo"):
@@ -146,9 +169,10 @@ def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Pa
 
 
 def describe_recording(arguments: argparse.Namespace, stored: Run) -> dict[str, Any] | None:
-    """Metadata of the demonstrations, `seed_index` among them; None where none are to be recorded.
+    """The metadata of the demonstrations that are to be recorded, such as `seed_index`; None without --record.
 
-    Raises `UsageError` where it cannot be said what to record.
+    Raises:
+        UsageError: there is nothing that could be recorded, or an option does not go with --record.
     """
     if arguments.record is None:
         for option, value in (("seed-index", arguments.seed_index), ("num-trajectories", arguments.num_trajectories)):

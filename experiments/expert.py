@@ -1,9 +1,10 @@
 """Trains a constrained expert on the task's own reward and records demonstrations.
 
-Which seed is recorded: among the seeds whose mean evaluation cost is at most the limit, the one with the highest mean
-return. If none keeps the limit nothing is written and the exit status is 1. With --unconstrained there is no limit and
-the highest return wins. Episodes are recorded with the stochastic policy, as it was trained. Hyperparameters start from
-the preset `expert`, those of Safety Gym tasks from `safety_gym_expert`.
+The policy of one seed is recorded: among the seeds whose mean evaluation cost is at most the limit, the one with the
+highest mean return. If no seed keeps the limit, nothing is recorded and the exit status is 1. With --unconstrained
+there is no limit, and the seed with the highest mean return is recorded. The policy samples its actions, as it did in
+training. Hyperparameters start from the preset that the task names: `safety_gym_expert` for Safety Gym tasks, `expert`
+for all others.
 """
 
 import argparse
@@ -24,7 +25,8 @@ from experiments.runs.recording import choose_seed, facts, print_demonstrations,
 from experiments.runs.resuming import resumed
 
 DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
-# What --resume may change: an expert that misses its limit goes on under another one, or with a stronger multiplier.
+# Fields that may change with --resume: an expert that misses its limit can be trained on with another limit, or with a
+# multiplier that reacts more strongly.
 MOVABLE = (
     "cost_limit",
     "multiplier_learning_rate",
@@ -42,9 +44,15 @@ def make_parser() -> Parser:
     options.add_run_options(parser, DEFAULTS)
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
-    parser.add_argument("--unconstrained", action="store_true", help="plain TRPO, blind to the cost (no --cost-limit)")
     parser.add_argument(
-        "--num-trajectories", default=10, type=command_line.positive, metavar="N", help="to record (default: 10)"
+        "--unconstrained", action="store_true", help="plain TRPO, which ignores the cost (no --cost-limit)"
+    )
+    parser.add_argument(
+        "--num-trajectories",
+        default=10,
+        type=command_line.positive,
+        metavar="N",
+        help="episodes to record (default: 10)",
     )
     parser.add_argument(
         "--run-dir", type=Path, metavar="DIR", help="run folder of the training (default: runs/<task>_<method>_<time>)"
@@ -95,7 +103,7 @@ def _limit_of(task: TaskInfo) -> float:
 
 
 def _resumed(folder: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The choices of the run in `folder`. Raises `UsageError` where `given` disagrees and may not."""
+    """The options of the run in `folder`. Raises `UsageError` where `given` differs in one that may not change."""
     saved = resumed(folder, {k: v for k, v in given.items() if k != "method"}, "--run-dir", MOVABLE)
     if saved["method"] != given["method"]:
         with_limit = "leave --unconstrained out" if given["method"] == "trpo" else "add --unconstrained"
@@ -112,7 +120,7 @@ def _resumed(folder: Path | None, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Trains, chooses, records; status 1 where no seed keeps the limit."""
+    """Trains, chooses a seed and records it. Returns the exit status, 1 if no seed keeps the limit."""
     plan = make_plan(arguments)
     outcome = execute(plan)
     seed = choose_seed(outcome.summary["per_seed"], plan.config.prescribed_limit)

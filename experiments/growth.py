@@ -1,7 +1,7 @@
 """How time and memory grow with seeds, simulations, network width and demonstrations: a table and a log-log figure.
 
-Every point is measured in a process of its own. Exponents are slopes of the logarithms over the larger half of a row's
-points, where what is constant matters least.
+Every point is measured in a process of its own. The exponent p of value = c size^p is the slope of log(value) against
+log(size), fitted to the larger half of the sizes, where constant costs matter least.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from experiments.cli.tables import show
 from experiments.runs import run_folder
 from experiments.speed import row_processes
 
-DEMONSTRATIONS = 10_000  # steps, where they do not vary
+DEMONSTRATIONS = 10_000  # steps of the demonstrations, on all axes but theirs
 AXES: Mapping[str, tuple[int, ...]] = {
     "seeds": (1, 2, 4, 8, 16, 32, 64),
     "simulations": (16, 64, 256, 1024, 4096),
@@ -39,7 +39,14 @@ def make_parser() -> Parser:
     parser = Parser("growth", __doc__ or "")
     parser.add_argument("--env", default="HalfCheetah", metavar="TASK", help="task (default: HalfCheetah)")
     parser.add_argument("--method", default="malm", choices=tuple(METHODS), help="what is trained (default: malm)")
-    parser.add_argument("--axes", nargs="+", choices=tuple(AXES), default=tuple(AXES), metavar="AXIS", help="of them")
+    parser.add_argument(
+        "--axes",
+        nargs="+",
+        choices=tuple(AXES),
+        default=tuple(AXES),
+        metavar="AXIS",
+        help=f"of {', '.join(AXES)} (default: all)",
+    )
     parser.add_argument("--largest", type=command_line.positive, metavar="N", help="leave out points beyond N")
     parser.add_argument("--out", type=Path, default=Path("growth"), metavar="DIR", help="new folder (default: growth)")
     parser.add_argument("--row", help=argparse.SUPPRESS)  # a setting as JSON: measure it here and print the result
@@ -47,7 +54,7 @@ def make_parser() -> Parser:
 
 
 def settings_of(arguments: argparse.Namespace) -> list[tuple[str, int, dict[str, Any]]]:
-    """(axis, value, setting) of every point; a batch holds at least one step of every simulation."""
+    """(axis, value, setting) of every point. A batch holds at least one step of every simulation."""
     task = options.find_task(arguments.env, "--env").name
     points = []
     for axis in arguments.axes:
@@ -81,7 +88,7 @@ def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
 
 
 def exponents_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float | None]]:
-    """By axis and measure; None where an axis has fewer than three points."""
+    """The exponent by axis and measure; None where an axis has fewer than three points."""
     found: dict[str, dict[str, float | None]] = {}
     for axis in dict.fromkeys(row["axis"] for row in rows):
         own = [row for row in rows if row["axis"] == axis]
@@ -91,7 +98,7 @@ def exponents_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]], title: str) -> None:
-    """One panel per axis, both scales logarithmic, each measure relative to its smallest point."""
+    """Draws one panel per axis; both scales are logarithmic, and each measure is relative to its first point."""
     from matplotlib.figure import Figure
 
     axes = list(dict.fromkeys(row["axis"] for row in rows))
@@ -119,7 +126,7 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]], title: str) -> None:
 
 
 def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
-    """All points as a terminal table, with each axis's exponents."""
+    """Prints all points as a table, with the exponents of each axis."""
     from rich.table import Table
 
     table = Table(title="growth", title_justify="left")
@@ -139,12 +146,13 @@ def print_rows(rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Measures all points, prints, draws and writes them."""
+    """Measures all points, writes and draws them, and prints the table."""
     if arguments.row is not None:
         setting = row_processes.begin_row(arguments.row)
         from experiments.speed import measuring  # imports JAX
+        from experiments.speed.setting import Setting
 
-        print(json.dumps(measuring.measure_training(measuring.Setting(**setting))))
+        print(json.dumps(measuring.measure_training(Setting(**setting))))
         return
     points = settings_of(arguments)
     command_line.check_output_folder(arguments.out, record="growth.json")

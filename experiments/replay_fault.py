@@ -1,4 +1,7 @@
-"""Replays the iteration that stopped a seed, from the diagnostic file in its run folder, and names what went wrong."""
+"""Repeats the iteration because of which a seed was given up, and names what is not finite after it.
+
+The diagnostic file of the seed, in its run folder, has the state before that iteration.
+"""
 
 import argparse
 import sys
@@ -18,12 +21,12 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("replay_fault", __doc__ or "")
     parser.add_argument("file", type=Path, metavar="FILE", help="fault_seed_N.npz of a run folder")
-    parser.add_argument("--demos", type=Path, metavar="FILE", help="where the demonstrations were moved to")
+    parser.add_argument("--demos", type=Path, metavar="FILE", help="the demonstrations of the run, if they were moved")
     return parser
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Prints what is not finite after the step; status 1 where the fault does not recur."""
+    """Prints what is not finite after the iteration. Returns the exit status, 1 if the fault does not recur."""
     try:
         found = replay(arguments.file, arguments.demos)
     except ArchiveError as error:
@@ -33,7 +36,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def replay(path: Path, demos: Path | None = None) -> list[str]:
-    """One unguarded iteration from the state in `path`: names of the metrics and parts of the state not finite."""
+    """Does one iteration, without the guard that would take it back, from the state in the file `path`.
+
+    Returns:
+        The names of the metrics and of the parts of the state that are not finite afterwards.
+    """
     run = run_folder.parse_run(path, fault_files.read_facts(path))
     task = run_folder.task_of(run)
     demonstrations = _demonstrations(run.facts["demonstrations"], demos)

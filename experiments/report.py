@@ -1,4 +1,4 @@
-"""One self-contained HTML page about finished runs: curves, metrics with intervals, every seed, what was different."""
+"""Writes one self-contained HTML page about finished runs: learning curves, metrics with intervals, and every seed."""
 
 import argparse
 import sys
@@ -23,14 +23,14 @@ def make_parser() -> Parser:
         "--figures", type=Path, metavar="DIR", help="also write each task's curves there, DIR/<task>.png"
     )
     parser.add_argument(
-        "--seed", default=0, type=command_line.natural, metavar="N", help="of the bootstrap (default: 0)"
+        "--seed", default=0, type=command_line.natural, metavar="N", help="of the bootstrap intervals (default: 0)"
     )
     parser.add_argument(
-        "--overwrite", action="store_true", help="replace existing files that are no page of this launcher"
+        "--overwrite",
+        action="store_true",
+        help="replace existing files, other than pages of this launcher, which are always replaced",
     )
-    parser.add_argument(
-        "--no-animation", action="store_true", help="leave out the episodes that are played on the page"
-    )
+    parser.add_argument("--no-animation", action="store_true", help="leave out the animated episodes")
     return parser
 
 
@@ -39,7 +39,7 @@ def _figure(folder: Path, task: str) -> Path:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Reads the runs and writes the page."""
+    """Reads the runs, then writes the page and the figures."""
     entries = read_entries(arguments.runs)
     path = arguments.out or (arguments.runs[0] if len(entries) == 1 else Path()) / "report.html"
     command_line.check_new_file(path, "--out", overwrite=arguments.overwrite or document.is_page(path))

@@ -1,6 +1,6 @@
-"""Trains a grid of hyperparameters in as few programs as it takes, and compares them in one table and one figure.
+"""Trains every combination of a grid of hyperparameters, and compares them in one table and one figure.
 
-SPEC is a TOML or JSON file. Its fields are the options of `train`; those under `grid` take several values each:
+SPEC is a TOML or JSON file. Its fields are the options of `train`; those under `grid` have a list of values each:
 
     env = "Swimmer"
     method = "malm"
@@ -13,9 +13,10 @@ SPEC is a TOML or JSON file. Its fields are the options of `train`; those under 
     multiplier_learning_rate = [0.01, 0.05, 0.2]
     hidden_sizes = [[64, 64], [100, 100]]
 
-Numbers inside the program, such as learning rates, share a program with all their seeds; every other field, such as
-task, method or sizes, makes programs of its own. These run in worker processes here, on a Ray cluster, or under SLURM;
-a worker that dies is replaced once. What is finished stays finished: an interrupted sweep goes on with --resume.
+Combinations that differ only in numbers inside the compiled program, such as learning rates, are trained together in
+one program, with all their seeds. Any other difference, such as in the task, the method or the sizes of networks, takes
+another program. Programs run in worker processes on this machine, on a Ray cluster, or under SLURM; a worker that dies
+is replaced once. An interrupted sweep goes on with --resume, and does not repeat what is finished.
 """
 
 import argparse
@@ -37,7 +38,7 @@ from experiments.sweeps import comparison, dispatch
 from experiments.sweeps.variants import Variant, make_variant, run_of, text
 
 _KEYS = ("env", "method", "fixed", "grid")
-_LONGEST_NAME = 120  # of a folder
+_LONGEST_NAME = 120  # of a variant's folder; longer names are replaced by numbers
 _COLUMNS = {
     "variant": "variant",
     "episode_return": "return",
@@ -57,7 +58,7 @@ def make_parser() -> Parser:
 
 
 def read_spec(path: Path) -> dict[str, Any]:
-    """The content of a spec, its tables present. Raises `UsageError` if it is missing or not of that form."""
+    """The content of a spec; `fixed` and `grid` are always there. Raises `UsageError` for a missing or wrong file."""
     read_json = functools.partial(json.loads, object_pairs_hook=_without_doubles)
     loaders: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": read_json}
     if path.suffix not in loaders:
@@ -90,7 +91,7 @@ def read_spec(path: Path) -> dict[str, Any]:
 
 
 def _without_doubles(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object; of two entries with one name JSON itself would keep the last."""
+    """A JSON object from its entries. Of two entries with the same name, Python would silently keep the last."""
     names = [name for name, _ in pairs]
     if doubles := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"'{doubles[0]}' is there twice")
@@ -110,13 +111,13 @@ def _check_grid(path: Path, spec: Mapping[str, Any]) -> None:
 
 
 def points(grid: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    """Every combination of the values, the last field's fastest."""
+    """Every combination of the values; those of the last field change fastest."""
     for values in itertools.product(*grid.values()):
         yield dict(zip(grid, values, strict=True))
 
 
 def variants_of(path: Path, spec: Mapping[str, Any], out: Path) -> dict[str, tuple[Variant, dict[str, Any]]]:
-    """The variants by name, each with its point of the grid. Raises `UsageError` that names the spec."""
+    """The variants by name, each with its point of the grid. Raises `UsageError`, which names the spec."""
     common = {key: spec[key] for key in ("env", "method") if key in spec} | spec["fixed"]
     load = functools.cache(load_demonstrations)
     found: dict[str, tuple[Variant, dict[str, Any]]] = {}
@@ -138,7 +139,7 @@ def variants_of(path: Path, spec: Mapping[str, Any], out: Path) -> dict[str, tup
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Trains what is missing, then writes sweep.csv and sweep.png; status 1 if a program failed."""
+    """Trains what is missing, then writes sweep.csv and sweep.png. Returns the exit status, 1 if a program failed."""
     spec = read_spec(arguments.spec)
     found = variants_of(arguments.spec, spec, arguments.out)
     num_failed = dispatch.carry_out([variant for variant, _ in found.values()], arguments, "sweep.json", spec)

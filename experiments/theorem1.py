@@ -1,9 +1,9 @@
 """Checks Theorem 1 on a decision process of 5 states and 3 actions, where everything can be computed exactly.
 
-The learner minimises 2 JS(rho, rho_E) - log 4 + max over lambda of lambda (J - J_E) - beta H. Two experts are imitated:
-a cheap one, whose cost the learner's entropy would exceed, so that the constraint binds, and a costly one, where it is
-slack. Each check prints what was measured beside what is allowed; one that fails ends the program with status 1.
-docs/theorem1.md says what the printed theorem leaves unsaid.
+The learner minimises 2 JS(rho, rho_E) - log 4 + max over lambda of lambda (J - J_E) - beta H. Two experts are imitated.
+One is cheap: without the constraint, the entropy bonus would make the learner cost more, so the constraint is active.
+The other is costly: the constraint is inactive. The table shows for each claim the measured error and the largest error
+allowed; if a claim fails, the exit status is 1. docs/theorem1.md gives the assumptions that the printed theorem omits.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from pathlib import Path
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser
 from experiments.cli.tables import show
-from experiments.theory import theorem1_checks
+from experiments.theory import theorem1_checks, theorem1_methods, theorem1_problem
 from experiments.theory.theorem1_checks import Check
 
 
@@ -30,7 +30,7 @@ def make_parser() -> Parser:
 
 
 def print_checks(checks: Sequence[Check]) -> None:
-    """The table."""
+    """Prints the claims as a table."""
     from rich.table import Table
 
     table = Table(title="Theorem 1, checked on 5 states and 3 actions", title_justify="left")
@@ -44,13 +44,13 @@ def print_checks(checks: Sequence[Check]) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Computes, prints, draws; status 1 where a claim fails."""
+    """Computes all claims, prints and draws them. Returns the exit status, 1 if a claim fails."""
     command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
     command_line.check_writable(arguments.out.parent, "--out")
-    problem = theorem1_checks.make_problem(arguments.seed)
+    problem = theorem1_problem.make_problem(arguments.seed)
     learners, small = theorem1_checks.bounded_learners(problem), theorem1_checks.distances(problem)
-    ccil = theorem1_checks.run_ccil(problem)
-    cvag, settled = theorem1_checks.run_cvag(problem)
+    ccil = theorem1_methods.run_ccil(problem)
+    cvag, settled = theorem1_methods.run_cvag(problem)
     checks = [
         *theorem1_checks.check_discriminator(problem),
         *theorem1_checks.check_bounded_multiplier(problem, learners),

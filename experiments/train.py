@@ -14,7 +14,7 @@ from experiments.runs.resuming import resumed
 
 
 def make_parser() -> Parser:
-    """Options that are not given stay absent, so that --resume can tell them from their defaults."""
+    """The options of this launcher. One that is not given is absent, so that --resume can tell it from a default."""
     parser = Parser("train", __doc__ or "")
     plans.add_options(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="run folder (default: runs/<task>_<method>_<time>)")
@@ -32,7 +32,7 @@ def make_plan(arguments: argparse.Namespace) -> RunPlan:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Checks everything, then trains; status 1 where a seed had to be given up."""
+    """Checks everything, then trains. Returns the exit status, 1 if a seed had to be given up."""
     return execute(make_plan(arguments)).status
 
 

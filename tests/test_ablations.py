@@ -13,6 +13,7 @@ from ccil_jax.methods import METHODS
 from experiments import ablations
 from experiments.ablations import QUESTIONS
 from experiments.runs import plans, run_folder
+from experiments.runs.metrics_file import MetricsWriter
 from experiments.sweeps import comparison, comparison_figures, variants
 from experiments.sweeps.comparison import Row, multiplier_path
 
@@ -130,7 +131,7 @@ def test_few_seeds_have_no_interval_and_violations_are_marked(
         seeds = [dict.fromkeys(comparison.SCORES, value) for value in values]
         levels = {"expert_cost": 30.0, "cost_limit": None, "env_steps": 9, "env_steps_per_second": None}
         run_folder.write_json(folder / "summary.json", {"per_seed": seeds, **levels, "runs_in_program": 2, **marks})
-        with run_folder.MetricsWriter(folder) as writer:
+        with MetricsWriter(folder) as writer:
             writer.begin({"env_steps": np.ones((1, 2)), "multiplier": np.zeros((1, 2))})
         setup = SimpleNamespace(task="Swimmer", num_seeds=2)
         plan = SimpleNamespace(folder=folder, setup=setup, config=Config(method="cvag"))

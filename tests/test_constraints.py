@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from ccil_jax.agents.build import AGENTS
 from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step
-from ccil_jax.learning.constraints import Episodes
+from ccil_jax.learning.constraints import EpisodeCosts
 from ccil_jax.methods import METHODS
 from ccil_jax.types import PyTree
 from tests.probe_envs import policy_problem
@@ -149,7 +149,7 @@ def test_the_episode_gate_takes_the_reward_on_steps_of_episodes_within_the_limit
     # Limit 4: of the first simulation the first episode is within, of the second the last (exactly at the limit).
     mixed = np.array([[1.0, -20.0], [3.0, -40.0], [-50.0, 6.0], [-70.0, 8.0]])
     constraint = constraints.alternating(Config(method="cvag", gate="episode"))
-    episodes = Episodes(cost=jnp.asarray(episode_cost), limit=jnp.asarray(4.0))
+    episodes = EpisodeCosts(cost=jnp.asarray(episode_cost), limit=jnp.asarray(4.0))
     gated = constraint.gate(jnp.asarray(reward), jnp.asarray(cost), episodes)
     np.testing.assert_allclose(gated, (mixed - mixed.mean()) / mixed.std(), rtol=1e-5)
     # The mixture is what the policy then ascends, whatever the batch's mean cost.
@@ -157,7 +157,7 @@ def test_the_episode_gate_takes_the_reward_on_steps_of_episodes_within_the_limit
 
 
 def test_no_other_method_gates_its_advantages() -> None:
-    reward, episodes = jnp.ones((3, 2)), Episodes(cost=jnp.full((3, 2), 9.0), limit=jnp.asarray(1.0))
+    reward, episodes = jnp.ones((3, 2)), EpisodeCosts(cost=jnp.full((3, 2), 9.0), limit=jnp.asarray(1.0))
     for name in (name for name, row in METHODS.items() if row.constraint):
         gated = constraints.make(Config(method=name, cost_limit=1.0)).gate(reward, -reward, episodes)
         np.testing.assert_array_equal(gated, reward)

@@ -19,7 +19,6 @@ from ccil_jax.agents.expert import expert_data
 from ccil_jax.agents.on_policy import AgentState
 from ccil_jax.config import Config
 from ccil_jax.learning import reward_models
-from ccil_jax.training import runner
 from ccil_jax.types import ExpertData, Metrics
 from tests.probe_envs import (
     WALK_DEMONSTRATIONS_COST,
@@ -135,7 +134,7 @@ def test_a_row_with_its_own_multiplier_is_ccil_with_that_choice(name: str, choic
 
 
 def test_cpo_il_far_within_its_limit_is_gail(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner, "resolve", lambda config, *_: config)
+    monkeypatch.setattr(build, "resolve", lambda config, *_: config)
     far, gail_run = (train(walk_config(method=name).replace(cost_limit=1e6), "far") for name in ("cpo_il", "gail"))
     # The estimate of an episode's cost begins at the limit, so before the first end of one there is no gap.
     assert_equal(far, gail_run)

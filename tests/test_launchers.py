@@ -21,6 +21,7 @@ from experiments import evaluate, expert, train
 from experiments.cli import options
 from experiments.cli.command_line import Parser, UsageError, command
 from experiments.runs import recording, run_folder
+from experiments.runs.metrics_file import read_metrics
 from tests.probe_envs import quick_compilation
 
 TINY = ["--preset", "tiny", "--max-episode-steps", "20", "--num-seeds", "2", "--eval-episodes", "3"]
@@ -132,7 +133,7 @@ def test_train_writes_the_run_folder(pipeline: Path, capsys: pytest.CaptureFixtu
     run = run_folder.read_run(folder)
     assert run.config.method == "malm"
     assert run.facts["demonstrations"]["sha256"] == file_sha256(pipeline / "expert.npz")
-    rows = run_folder.read_metrics(folder)
+    rows = read_metrics(folder)
     assert rows["env_steps"].tolist() == [[120.0, 120.0], [240.0, 240.0]]
     assert {"cost_rate", "multiplier", "meta_gradient", "discriminator_accuracy_held_out"} <= set(rows)
     assert all(np.isfinite(values).all() for values in rows.values())
@@ -387,7 +388,7 @@ def test_an_expert_goes_on_under_another_limit(pipeline: Path, tmp_path: Path) -
     made = ["--out", f"{tmp_path}/e.npz", "--run-dir", f"{tmp_path}/expert", "--resume"]
     more = ["--cost-limit", "19", "--multiplier-learning-rate", "0.5", "--env-steps", "360"]
     assert expert.main([*made, *more, "--num-trajectories", "2"]) == 0
-    before, after = (run_folder.read_metrics(folder / "expert") for folder in (pipeline, tmp_path))
+    before, after = (read_metrics(folder / "expert") for folder in (pipeline, tmp_path))
     assert len(before["env_steps"]) < len(after["env_steps"])
     for name, rows in before.items():
         np.testing.assert_array_equal(after[name][: len(rows)], rows)
@@ -402,7 +403,7 @@ def test_an_expert_goes_on_under_another_limit(pipeline: Path, tmp_path: Path) -
     assert load_demonstrations(tmp_path / "e.npz").metadata["cost_limit"] == 18.0
     assert evaluate.main([f"{tmp_path}/expert", "--episodes", "2"]) == 0
     assert expert.main([*made, "--overwrite", "--env-steps", "480", "--num-trajectories", "2"]) == 0
-    assert len(run_folder.read_metrics(tmp_path / "expert")["env_steps"]) == 4
+    assert len(read_metrics(tmp_path / "expert")["env_steps"]) == 4
 
 
 def test_a_resume_that_is_refused_leaves_the_run_as_it_was(

@@ -22,6 +22,7 @@ from experiments.cli.command_line import UsageError
 from experiments.page import document
 from experiments.page.entries import read_entries
 from experiments.runs import execution, figures, labels, run_folder, summary
+from experiments.runs.metrics_file import MetricsWriter, read_metrics
 from experiments.runs.summary import Reference, aggregate_scores, scores
 from experiments.speed import tables
 
@@ -66,7 +67,7 @@ def make_run(
     }
     if method == "bc":
         rows = {"env_steps": 0 * steps, "loss": 1 / steps, "held_out_loss": 2 / steps}
-    with run_folder.MetricsWriter(folder) as writer:
+    with MetricsWriter(folder) as writer:
         writer.write(5, rows)
     levels: dict[str, Any] = {"expert_return": 100.0, "expert_cost": 30.0, "random_return": 0.0, "random_cost": 1.0}
     reference = Reference(**levels, cost_limit=None, **errors)
@@ -196,7 +197,7 @@ def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
     """As a run's label, in the legend, and as a task, in the title; and on the page."""
     folders = [make_run(tmp_path / name, "malm", task=name), make_run(tmp_path / "b", "malm", task=name)]
     entries = read_entries(folders)
-    curves = [figures.Curve(name, run_folder.read_metrics(folders[0]), {}, None)]
+    curves = [figures.Curve(name, read_metrics(folders[0]), {}, None)]
     figure = figures.draw_panels(curves, name, ["cost_rate"])
     assert figures.png(figure).startswith(b"\x89PNG")
     shown = [figure.legends[0].get_texts()[0], figure._suptitle]
@@ -460,8 +461,8 @@ def test_a_report_replaces_nothing_but_a_report(tmp_path: Path, capsys: pytest.C
 
 def test_a_run_that_goes_on_is_not_reported_as_finished(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = make_run(tmp_path / "run", "gail")
-    metrics = {name: rows[-1:] for name, rows in run_folder.read_metrics(folder).items()}
-    with run_folder.MetricsWriter(folder) as writer:
+    metrics = {name: rows[-1:] for name, rows in read_metrics(folder).items()}
+    with MetricsWriter(folder) as writer:
         writer.begin({})
         writer.write(6, {**metrics, "env_steps": metrics["env_steps"] + 6000})
     run = run_folder.read_run(folder)

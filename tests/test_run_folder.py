@@ -13,6 +13,7 @@ import pytest
 
 from experiments.cli.command_line import UsageError
 from experiments.runs import provenance, run_folder
+from experiments.runs.metrics_file import MetricsWriter, read_metrics
 
 
 def metrics(num_iterations: int, first: int = 0, **more: float) -> dict[str, np.ndarray]:
@@ -23,7 +24,7 @@ def metrics(num_iterations: int, first: int = 0, **more: float) -> dict[str, np.
 
 
 def test_metrics_file_has_one_row_per_iteration_and_seed(tmp_path: Path) -> None:
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.write(2, metrics(2, kl=0.01, new_metric=1.0))
         writer.write(3, metrics(1, first=2, kl=0.02, new_metric=1.0))
     with (tmp_path / "metrics.csv").open(newline="") as file:
@@ -31,7 +32,7 @@ def test_metrics_file_has_one_row_per_iteration_and_seed(tmp_path: Path) -> None
     assert rows[0] == ["iteration", "seed", "env_steps", "episode_return", "kl", "new_metric"]
     assert rows[1:3] == [["1", "0", "100", "1", "0.01", "1"], ["1", "1", "100", "1.5", "0.01", "1"]]
     assert [row[:2] for row in rows[1:]] == [[str(i), str(s)] for i in (1, 2, 3) for s in (0, 1)]
-    read = run_folder.read_metrics(tmp_path)
+    read = read_metrics(tmp_path)
     np.testing.assert_array_equal(read["episode_return"], [[1, 1.5], [2, 2.5], [3, 3.5]])
     assert "iteration" not in read
     assert list(tmp_path.glob("events.*"))
@@ -39,13 +40,13 @@ def test_metrics_file_has_one_row_per_iteration_and_seed(tmp_path: Path) -> None
 
 def test_a_resumed_run_repeats_no_row(tmp_path: Path) -> None:
     """Killed in the middle of a line, iterations after the last checkpoint, that of iteration 2."""
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.begin({})
         writer.write(4, metrics(4))
     path = tmp_path / "metrics.csv"
     whole = path.read_text()
     path.write_text(whole[:-5])
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.begin(metrics(2))
         writer.write(3, metrics(1, first=2))
         writer.write(4, metrics(1, first=3))
@@ -54,11 +55,11 @@ def test_a_resumed_run_repeats_no_row(tmp_path: Path) -> None:
 
 def test_counters_pass_31_bits(tmp_path: Path) -> None:
     """Nine digits would do for float32, not for steps."""
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.begin({})
         writer.write(1, {"env_steps": np.array([[2**31 + 1]])})
     assert (tmp_path / "metrics.csv").read_text().splitlines() == ["iteration,seed,env_steps", "1,0,2147483649"]
-    assert run_folder.read_metrics(tmp_path)["env_steps"].item() == 2**31 + 1
+    assert read_metrics(tmp_path)["env_steps"].item() == 2**31 + 1
 
 
 @pytest.mark.parametrize("content", [None, "", "iteration,seed\n", "iteration,seed,x\n1,0,1\n1,1\n"])
@@ -66,7 +67,7 @@ def test_damaged_metrics_are_reported(tmp_path: Path, content: str | None) -> No
     if content is not None:
         (tmp_path / "metrics.csv").write_text(content)
     with pytest.raises(UsageError, match=r"metrics\.csv: missing, empty or damaged"):
-        run_folder.read_metrics(tmp_path)
+        read_metrics(tmp_path)
 
 
 def test_json_is_strict_and_whole(tmp_path: Path) -> None:
@@ -83,7 +84,7 @@ def test_a_full_disk_is_told_with_its_folder(tmp_path: Path, monkeypatch: pytest
     def full(_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.begin({})
         monkeypatch.setattr(writer._events, "write_event", full)
         with pytest.raises(OSError, match="No space left") as caught:
@@ -109,12 +110,12 @@ def test_nothing_is_said_of_episodes_before_one_has_ended(tmp_path: Path) -> Non
     """Two seeds: none has an episode after the first iteration, one after the second, both after the third."""
     nan = np.nan
     rows = metrics(3) | {"episode_cost": np.array([[nan, nan], [nan, 4.0], [2.0, 6.0]])}
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.begin({})
         writer.write(3, rows)
     with (tmp_path / "metrics.csv").open(newline="") as file:
         assert [row["episode_cost"] for row in csv.DictReader(file)] == ["", "", "", "4", "2", "6"]
-    np.testing.assert_array_equal(run_folder.read_metrics(tmp_path)["episode_cost"], rows["episode_cost"])
+    np.testing.assert_array_equal(read_metrics(tmp_path)["episode_cost"], rows["episode_cost"])
     said = [values for _, values in events(tmp_path)]
     costs = [{tag: value for tag, value in values.items() if tag.endswith("/episode_cost")} for values in said]
     assert costs == [
@@ -128,9 +129,9 @@ def test_nothing_is_said_of_episodes_before_one_has_ended(tmp_path: Path) -> Non
 def test_folders_of_earlier_versions_are_read_without_their_placeholders(tmp_path: Path) -> None:
     rows = metrics(3) | {"episode_cost": np.array([[25.0, 25.0], [25.0, 4.0], [2.0, 6.0]])}
     rows |= {"episodes_finished": np.array([[0, 0], [0, 1], [1, 0]]), "kl": np.full((3, 2), 0.5)}
-    with run_folder.MetricsWriter(tmp_path) as writer:
+    with MetricsWriter(tmp_path) as writer:
         writer.begin(rows)
-    read, nan = run_folder.read_metrics(tmp_path), np.nan
+    read, nan = read_metrics(tmp_path), np.nan
     np.testing.assert_array_equal(read["episode_cost"], [[nan, nan], [nan, 4.0], [2.0, 6.0]])
     np.testing.assert_array_equal(read["episode_return"], [[nan, nan], [nan, 2.5], [3.0, 3.5]])
     np.testing.assert_array_equal(read["kl"], rows["kl"])
@@ -141,7 +142,7 @@ def test_events_advance_where_no_environment_steps_are_taken(tmp_path: Path) -> 
     cloning, steps = tmp_path / "cloning", tmp_path / "steps"
     for folder, rows in ((cloning, {"env_steps": np.zeros((2, 1))}), (steps, {"env_steps": np.full((2, 1), 50)})):
         folder.mkdir()
-        with run_folder.MetricsWriter(folder) as writer:
+        with MetricsWriter(folder) as writer:
             writer.begin({})
             for iteration in (2, 4):
                 writer.write(iteration, rows | {"loss": np.ones((2, 1))})

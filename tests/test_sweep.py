@@ -20,6 +20,7 @@ from ccil_jax.training import manifests, runner
 from experiments import sweep
 from experiments.cli.command_line import UsageError
 from experiments.runs import run_folder
+from experiments.runs.metrics_file import read_metrics
 from experiments.sweeps import backends, machine, variants, worker
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config
 from tests.processes import command_lines, in_proc
@@ -204,12 +205,10 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
     for name in ("multiplier_learning_rate=0.01,hidden_sizes=4", "multiplier_learning_rate=0.5,hidden_sizes=8,8"):
         folder = out / "runs" / name
         assert {"config.json", "metrics.csv", "summary.json", "checkpoints"} <= {p.name for p in folder.iterdir()}
-        assert run_folder.read_metrics(folder)["episode_cost"].shape == (2, 2)
+        assert read_metrics(folder)["episode_cost"].shape == (2, 2)
         assert run_folder.read_json(folder / "summary.json")["runs_in_program"] == 4
     # Both learning rates see the same first batch, and answer it differently.
-    slow, fast = (
-        run_folder.read_metrics(out / "runs" / f"multiplier_learning_rate={rate},hidden_sizes=4") for rate in GRID_RATES
-    )
+    slow, fast = (read_metrics(out / "runs" / f"multiplier_learning_rate={rate},hidden_sizes=4") for rate in GRID_RATES)
     np.testing.assert_array_equal(slow["episode_return"][0], fast["episode_return"][0])
     assert (slow["multiplier"][-1] != fast["multiplier"][-1]).all()
 
@@ -217,7 +216,7 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
 
     # Interrupted: what is finished stays as it is, what is not is finished, from the checkpoints of its program.
     folder = out / "runs" / "multiplier_learning_rate=0.5,hidden_sizes=4"
-    before, scores = run_folder.read_metrics(folder), run_folder.read_json(folder / "summary.json")["per_seed"]
+    before, scores = read_metrics(folder), run_folder.read_json(folder / "summary.json")["per_seed"]
     (folder / "summary.json").unlink()
     others = {
         path: path.stat().st_mtime_ns
@@ -236,7 +235,7 @@ def test_a_sweep_survives_a_killed_worker_and_resumes(
     assert (program / "worker.log").read_text() == log
     assert {path: path.stat().st_mtime_ns for path in others} == others
     assert sorted(path.name for path in (folder / "checkpoints").glob("[0-9]*")) == ["2"]
-    after = run_folder.read_metrics(folder)
+    after = read_metrics(folder)
     assert all(np.array_equal(before[name], after[name], equal_nan=True) for name in before)
     checkpoints_agree_with_metrics(out)
 
@@ -256,7 +255,7 @@ def checkpoints_agree_with_metrics(out: Path) -> None:
         env = envs.make("Swimmer", **run.facts["env_options"])
         assert jax.tree.leaves(runner.load(run.config, env, folder / "checkpoints", 2).actor)
         saved = manifests.read(folder / "checkpoints" / "2")["arrays"]
-        metrics = run_folder.read_metrics(folder)
+        metrics = read_metrics(folder)
         assert {name for name in saved if name.startswith("history.")} == {f"history.{name}" for name in metrics}
         for name, rows in metrics.items():  # nine digits are enough for a float32 number
             fact = saved[f"history.{name}"]

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from experiments import theorem1
-from experiments.theory import tabular, theorem1_checks
-from experiments.theory.theorem1_checks import Problem
+from experiments.theory import tabular, theorem1_checks, theorem1_methods, theorem1_problem
+from experiments.theory.theorem1_problem import Problem
 
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return theorem1_checks.make_problem(1)
+    return theorem1_problem.make_problem(1)
 
 
 def test_every_claim_holds_and_the_figure_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -38,11 +38,11 @@ def test_a_wrong_ingredient_fails(problem: Problem, monkeypatch: pytest.MonkeyPa
         return
     solution = problem.bound_by_cheap
     other = 0.5 * solution.multiplier if wrong == "half the multiplier" else 0.0
-    learner = tabular.learner(problem.process, problem.cheap, theorem1_checks.BETA, other)
+    learner = tabular.learner(problem.process, problem.cheap, theorem1_problem.BETA, other)
     mistaken = dataclasses.replace(problem, bound_by_cheap=learner)
     assert not all(check.passed for check in theorem1_checks.check_slackness(mistaken))
-    rounds = np.ones(theorem1_checks.NUM_ROUNDS)
-    run = theorem1_checks.Run(cost=rounds, multiplier=solution.multiplier * rounds, distance=0 * rounds)
+    rounds = np.ones(theorem1_methods.NUM_ROUNDS)
+    run = theorem1_methods.Run(cost=rounds, multiplier=solution.multiplier * rounds, distance=0 * rounds)
     assert theorem1_checks.check_methods(mistaken, run, run, solution)[1].passed is False
 
 

@@ -14,6 +14,7 @@ from experiments import ablations, benchmark, convert, evaluate, expert, report,
 from experiments.cli import command_line
 from experiments.cli.names import safe_name
 from experiments.runs import run_folder
+from experiments.runs.metrics_file import read_metrics
 from experiments.sweeps import backends, worker
 from tests.probe_envs import quick_compilation
 
@@ -22,6 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import ccil_jax
+from ccil_jax.acting.distributions import Gaussian
 from envs.base import executed, first_state, next_state
 
 
@@ -57,6 +60,19 @@ def short(push: float = 0.2):
 
 def broken(push):
     return Cart(10, push)
+
+
+def linear(config, env):
+    def init(key):
+        return {"weights": jnp.zeros((env.obs_dim, env.action_dim)), "log_std": jnp.zeros(env.action_dim)}
+
+    def apply(params, obs):
+        return Gaussian(mean=obs @ params["weights"], log_std=params["log_std"])
+
+    return ccil_jax.Policy(init, apply)
+
+
+LINEAR = ccil_jax.Method(reward="task", constraint="unconstrained", imitates=False, policy=linear)
 '''
 TASK = "my_task:make"
 TINY = ["--preset", "tiny", "--num-seeds", "2", "--eval-episodes", "3"]
@@ -97,7 +113,7 @@ def test_demonstrations_name_the_task_and_its_options(folder: Path) -> None:
 def test_a_run_goes_on_for_longer(folder: Path) -> None:
     assert train.main(["--resume", "--out", "run", "--env-steps", "360"]) == 0
     assert run_folder.read_json(Path("run/summary.json"))["env_steps"] == 360
-    assert run_folder.read_metrics(Path("run"))["env_steps"][:, 0].tolist() == [120.0, 240.0, 360.0]
+    assert read_metrics(Path("run"))["env_steps"][:, 0].tolist() == [120.0, 240.0, 360.0]
     facts = run_folder.read_run(Path("run")).facts
     assert (facts["task"], facts["env_options"]) == (TASK, {"push": 0.2, "max_episode_steps": 20})
 
@@ -118,6 +134,18 @@ def test_evaluate_records_and_exports(folder: Path) -> None:
     entry = run_folder.read_json(Path("run/evaluation.json"))["ours"]
     assert [row["episode_length"] for row in entry["per_seed"]] == [20.0, 20.0]
     assert convert.main(["more.npz", "--env", TASK, "--out", "converted.npz"]) == 0
+
+
+def test_a_method_with_a_policy_of_its_own(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It can do all that needs no NumPy."""
+    given = ["--env", TASK, "--method", "my_task:LINEAR", "--env-steps", "120", *TINY]
+    assert train.main([*given, "--out", "linear"]) == 0
+    assert evaluate.main(["linear", "--episodes", "2", "--export", "linear.stablehlo"]) == 0
+    assert Path("linear.stablehlo").is_file()
+    message = "--export linear.npz: method my_task:LINEAR has a policy of its own, which only JAX can compute"
+    capsys.readouterr()
+    assert message in refused(capsys, evaluate, "linear", "--export", "linear.npz")
+    assert report.main(["linear", "--out", "linear.html"]) == 0
 
 
 def test_a_report_needs_no_animation(folder: Path) -> None:

@@ -1,6 +1,6 @@
-"""What every launcher shares: one-line errors with exit status 2, and checks of output folders.
+"""What every launcher shares: errors of one line with exit status 2, and checks of output folders.
 
-Nothing here imports JAX, so help and wrong input are answered at once.
+Nothing here imports JAX, so that `--help` and wrong input are answered at once.
 """
 
 import argparse
@@ -20,8 +20,8 @@ from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
 from experiments.cli import xla
 from experiments.cli.names import safe_name
 
-CONSOLE = "ccil"  # the command that an installation brings along; `experiments.cli.console` carries it out
-MAX_ERROR = 1000  # characters of an error message, which may quote a file
+CONSOLE = "ccil"  # the command that comes with an installation; `experiments.cli.console` carries it out
+MAX_ERROR = 1000  # length of an error message in characters; it may quote a file, which may be long
 
 
 class UsageError(UserError):
@@ -29,14 +29,14 @@ class UsageError(UserError):
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose every complaint is one line; `--num_seeds` and `--num-seeds` are the same option."""
+    """An argument parser whose error messages are one line each; it takes `--num_seeds` for `--num-seeds`."""
 
     def __init__(self, name: str, description: str) -> None:
         super().__init__(
             prog=launcher_command(name),
             usage=f"{launcher_command(name)} [options]",
             description=description,
-            allow_abbrev=False,  # an abbreviation would change its meaning when options are added
+            allow_abbrev=False,  # an abbreviation may mean another option once there are more options
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
 
@@ -57,9 +57,9 @@ class Parser(argparse.ArgumentParser):
 
 
 def error_line(program: str, message: str) -> str:
-    """The line on stderr by which `program` says what is wrong."""
+    """The line with which `program` says on stderr what is wrong."""
     line = " ".join(message.split())
-    line = "".join(c if c.isprintable() else "?" for c in line)  # text from a file may not steer the terminal
+    line = "".join(c if c.isprintable() else "?" for c in line)  # quoted text must not control the terminal
     line = line if len(line) <= MAX_ERROR else f"{line[:MAX_ERROR]}..."
     return f"{program}: error: {line}\n"
 
@@ -70,7 +70,10 @@ def _hyphenated(token: str) -> str:
 
 
 def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None], argv: Sequence[str] | None) -> int:
-    """Parses and runs; wrong input found later than parsing ends in the same one line and exit status 2."""
+    """Parses the arguments and runs the launcher. Returns its exit status.
+
+    Wrong input ends the process with one line on stderr and exit status 2, also if it is found after parsing.
+    """
     arguments = parser.parse_args(argv)
     xla.widen_vectors()
     xla.tune_gpus()
@@ -87,17 +90,17 @@ def run_launcher(parser: Parser, run: Callable[[argparse.Namespace], int | None]
 
 
 def command() -> str:
-    """The command line of this process, quoted so that a shell repeats it."""
+    """The command line of this process, quoted for a shell."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     if spec:
         return shlex.join(["python", "-m", spec.name, *sys.argv[1:]])
     if _is_console():
         return shlex.join([CONSOLE, *sys.argv[1:]])
-    return shlex.join(["python", *sys.orig_argv[1:]])  # a script, with its folder, or the code after `-c`
+    return shlex.join(["python", *sys.orig_argv[1:]])  # a script with its path, or the code after `-c`
 
 
 def launcher_command(name: str) -> str:
-    """What a person types to start the launcher `name`, in the way in which this process was started."""
+    """What a person types to start the launcher `name`: `ccil NAME` if this process was started so, or `python -m`."""
     return f"{CONSOLE} {name}" if _is_console() else f"python -m experiments.{name}"
 
 
@@ -121,14 +124,14 @@ def positive(text: str) -> int:
 
 
 def natural(text: str) -> int:
-    """An integer that fits a 32-bit seed."""
+    """An integer from 0 to 2^32 - 1, the range of a seed."""
     if not 0 <= integer(text) < 2**32:
         raise argparse.ArgumentTypeError(f"{text}: must be at least 0 and below 2**32")
     return integer(text)
 
 
 def boolean(text: str) -> bool:
-    """Truth in the usual spellings."""
+    """True or false, in one of the usual spellings."""
     if text.lower() not in ("true", "false", "yes", "no", "1", "0"):
         raise argparse.ArgumentTypeError(f"{text!r}: give true or false")
     return text.lower() in ("true", "yes", "1")
@@ -164,13 +167,20 @@ def default_folder(task: str, method: str, option: str = "--out") -> Path:
 def check_output_folder(
     folder: Path, *, resume: bool = False, option: str = "--out", record: str = "config.json"
 ) -> None:
-    """Makes `folder` and proves that it can be written. Raises `UsageError`, also where runs would be mixed.
+    """Makes `folder`, checks that it can be written and that it does not mix two runs.
 
-    A folder with a file `record` holds a run that can be resumed.
+    Args:
+        folder: for the results.
+        resume: whether the run in the folder is to be continued.
+        option: names the folder in error messages.
+        record: the file by which a folder with a run is recognised.
+
+    Raises:
+        UsageError: the folder holds another run or other files, or none that could be resumed, or cannot be written.
     """
     try:
         holds_run = (folder / record).is_file()
-        # A process that was killed before it began leaves locks and temporary files, whose names begin with a dot.
+        # Files whose names begin with a dot are locks and temporary files of a process that was killed at its start.
         occupied = folder.is_dir() and any(path for path in folder.rglob("*") if not _is_left_over(path))
     except OSError as error:
         raise UsageError(f"{option} {folder}: cannot be read ({error.strerror}); choose another folder") from None
@@ -190,7 +200,7 @@ def _is_left_over(path: Path) -> bool:
 
 
 def check_new_file(path: Path, option: str, *, overwrite: bool) -> None:
-    """Raises `UsageError` that names `option` where the file `path` would replace another, or a folder."""
+    """Raises `UsageError`, which names `option`, if `path` is a folder, or a file that must not be replaced."""
     if path.is_dir():
         raise UsageError(f"{option} {path}: is a folder; give the name of a file")
     if path.exists() and not overwrite:
@@ -198,7 +208,7 @@ def check_new_file(path: Path, option: str, *, overwrite: bool) -> None:
 
 
 def check_writable(folder: Path, option: str) -> None:
-    """Makes `folder` and writes a byte in it. Raises `UsageError` that names `option`."""
+    """Makes `folder` and writes a byte in it. Raises `UsageError`, which names `option`, if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:

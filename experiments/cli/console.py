@@ -1,4 +1,4 @@
-"""The command `ccil NAME ...`: as `python -m experiments.NAME ...`, but from any folder."""
+"""The command `ccil NAME ...`, which does the same as `python -m experiments.NAME ...` and works in any folder."""
 
 import ast
 import difflib
@@ -15,7 +15,7 @@ _MAIN = "\ndef main("
 
 
 def launchers() -> dict[str, str]:
-    """The first line of each launcher's docstring, by name. None of them is imported."""
+    """The names of all launchers, with the first lines of their docstrings. The files are read, not imported."""
     found = {}
     for path in sorted(Path(__file__).parents[1].glob("*.py")):
         text = path.read_text(encoding="utf-8")

@@ -1,10 +1,12 @@
-"""SIGTERM, SIGINT and SIGUSR1: a training saves and leaves, anything else leaves at once; status 128 + signal.
+"""What SIGTERM, SIGINT and SIGUSR1 do: a training saves its state and ends; anything else ends at once.
 
-A signal that was ignored when the process began stays ignored: `nohup` and shells that start background jobs do this so
-that a Ctrl-C meant for another program does not end the job.
+The exit status is 128 plus the number of the signal.
 
-Python runs its handlers between two bytecodes of the main thread, which compiles for minutes inside XLA. So a thread
-of its own hears of a signal, through the pipe that Python's C handler writes to.
+A signal that was ignored when the process began stays ignored. `nohup` and shells start background jobs in this way, so
+that a Ctrl-C that is meant for another program does not end them.
+
+Python runs a signal's handler in the main thread, between two bytecodes. But the main thread may compile inside XLA for
+minutes. Therefore another thread waits for signals: Python's C handler writes the number of each signal into a pipe.
 """
 
 import os
@@ -14,12 +16,15 @@ import threading
 from types import TracebackType
 from typing import NoReturn, Self
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # batch systems announce the end by one of these
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # batch systems announce the end of a job by one of them
 _SHOW_CURSOR = "\x1b[?25h"
 
 
 class Interruption:
-    """Use it as a context manager in the main thread. While `defer` holds, a first signal is kept for the caller."""
+    """Handles the signals. Use it as a context manager in the main thread; in any other thread it does nothing.
+
+    After `defer`, a first signal only makes `requested` true. A second one ends the process at once.
+    """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -51,16 +56,19 @@ class Interruption:
             os.close(self._ears)
 
     def defer(self) -> None:
-        """From now on there is something to save: a signal is kept until `requested` is asked."""
+        """From now on there is something to save: a signal makes `requested` true and does not end the process."""
         with self._lock:
             self._deferred = True
 
     def requested(self) -> bool:
-        """Whether a signal came."""
+        """Whether a signal has come."""
         return self._requested is not None
 
     def settle(self, state: str) -> None:
-        """What there was to save is saved: leaves if a signal came, and at once when the next comes."""
+        """Everything is saved: ends the process if a signal has come, with `state` as the message.
+
+        From now on a signal ends the process at once.
+        """
         with self._lock:
             self._deferred = False
             if self._requested is not None:
@@ -78,7 +86,7 @@ class Interruption:
 
 
 def _is_heard(number: signal.Signals) -> bool:
-    """Whether a signal has an effect; None stands for a handler of C code, which Python could not put back."""
+    """Whether to handle the signal: it is not ignored, and its handler (None if it is C code) can be restored."""
     return signal.getsignal(number) not in (signal.SIG_IGN, None)
 
 
@@ -87,7 +95,7 @@ def _farewell(number: signal.Signals, state: str) -> str:
 
 
 def _leave(number: signal.Signals) -> NoReturn:
-    """Ends the process from any thread, whatever the main thread does."""
+    """Ends the process from any thread, even while the main thread is inside C code."""
     cursor = _SHOW_CURSOR if os.isatty(2) else ""
     text = _farewell(number, "stopped; nothing that was saved is lost, and --resume continues from there")
     os.write(2, f"{cursor}\n{text}\n".encode())
@@ -95,15 +103,16 @@ def _leave(number: signal.Signals) -> NoReturn:
 
 
 def stop_at_eof() -> None:
-    """SIGTERM for this process as soon as its standard input ends: whoever waits for it, holding that open, is gone.
+    """Sends this process SIGTERM as soon as its standard input ends.
 
-    SIGTERM is also how whoever waits stops this process. So it is heard even where it was ignored when that one began.
+    A parent process that waits for this one holds the input open; its end closes the input, however it ends. The parent
+    also uses SIGTERM to stop this process. So SIGTERM is no longer ignored, even if the parent was started that way.
     """
     if not _is_heard(signal.SIGTERM):
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
     def wait() -> None:
-        while os.read(sys.stdin.fileno(), 1):  # not through its buffer, whose lock Python wants when it ends
+        while os.read(sys.stdin.fileno(), 1):  # not by sys.stdin.read, which holds a lock that Python needs to exit
             pass
         os.kill(os.getpid(), signal.SIGTERM)
 

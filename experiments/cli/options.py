@@ -1,4 +1,4 @@
-"""Options that training launchers share: the `Config` fields, and what a run is besides its hyperparameters."""
+"""Options that the training launchers share: the fields of `Config`, and the choices besides hyperparameters."""
 
 import argparse
 import dataclasses
@@ -31,7 +31,7 @@ DEFAULTS: Mapping[str, Any] = {
 
 
 def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> None:
-    """Everything in `DEFAULTS` and --env. What is not given is absent from the parsed arguments."""
+    """Adds --env and the options in `DEFAULTS`. An option that is not given is absent from the parsed arguments."""
 
     def add(name: str, text: str, **settings: Any) -> None:
         default = defaults.get(name)
@@ -40,11 +40,16 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
 
     add("env", f"task: {', '.join(TASKS)}; or package.module:function, which builds your own", metavar="TASK")
     add("num_seeds", "seeds trained side by side in one program", type=positive, metavar="S")
-    add("seed", "base seed: the same seed, number of seeds and versions give the same bits", type=natural, metavar="N")
+    add(
+        "seed",
+        "base seed: the same seed, number of seeds and versions give the same results, bit for bit",
+        type=natural,
+        metavar="N",
+    )
     add(
         "one_by_one",
-        "whether a device takes its seeds in turn: its bits then depend neither on the number of seeds nor on that of "
-        "cores (runs in turn do not fill a GPU)",
+        "train the seeds of a device one after the other: then the results of a seed are the same, bit for bit, for "
+        "any number of seeds and cores (slow on a GPU, which a single seed does not fill)",
         type=boolean,
         metavar="BOOL",
     )
@@ -62,13 +67,15 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
 
 
 def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = tuple(METHODS)) -> None:
-    """One option per `Config` field but the method, grouped by who uses them; `--help` shows the preset's values.
+    """Adds an option for each field of `Config` except the method, grouped by the methods that use the fields.
 
-    A field that none of `methods` uses is left out of `--help`; given all the same, it is refused with the reason. What
-    is not given is absent from the parsed arguments.
+    `--help` shows the values of the preset as defaults, and leaves out fields that none of `methods` uses. Such an
+    option is accepted here, so that the check of the configuration can say why it has no effect. An option that is not
+    given is absent from the parsed arguments.
     """
     parser.epilog = (
-        "static: shapes the program, so that a change compiles it anew; all other numbers may vary within it"
+        "static: the value shapes the compiled program, so that another value needs another compilation; "
+        "all other values are numbers inside the program"
     )
     groups: dict[Use, Any] = {}
     defaults = Config(**PRESETS[preset])
@@ -94,10 +101,15 @@ def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = 
 
 
 def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] = MappingProxyType({})) -> Config:
-    """The preset, then what a run that is resumed has `saved`, then the options given, validated.
+    """The configuration of a run, checked.
+
+    Args:
+        given: the options that a person gave; they come before all else.
+        preset: the hyperparameters to start from.
+        saved: the options of a run that is resumed; they come before the preset.
 
     Raises:
-        ConfigError: also for an option given that makes no difference to the run.
+        ConfigError: a value is wrong, or a given option makes no difference to the run.
     """
     base, changes = ({k: v for k, v in fields.items() if k in CONFIG_FIELDS} for fields in (saved, given))
     config = Config.from_base({**PRESETS[preset], **base}, changes)

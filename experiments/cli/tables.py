@@ -10,7 +10,7 @@ BEYOND_ERROR = "beyond the demonstrations' error"  # what the mark of a violatio
 
 
 def show(table: Any) -> None:
-    """Prints a rich table, in a pipe or log at the width that it needs; its texts are shown as they are, no markup."""
+    """Prints a rich table. Its texts are shown as they are, without markup. In a pipe or a log file it is 160 wide."""
     from rich.console import Console
 
     console = Console(markup=False, emoji=False)
@@ -20,7 +20,7 @@ def show(table: Any) -> None:
 
 
 def marked(text: str, beyond_error: bool | None) -> str:
-    """A violation with the mark that it deserves."""
+    """The text of a violation, with a star behind it if it is beyond the error of the demonstrations."""
     return f"{text} *" if beyond_error else text
 
 
@@ -30,5 +30,5 @@ def with_error(mean: float | None, error: float | None) -> str:
 
 
 def bounds(low: float | None, high: float | None) -> str:
-    """An interval in brackets, a dash in them where there is none."""
+    """An interval in brackets, such as `[1.00, 2.00]`; `[-]` where there is none."""
     return "[-]" if low is None or high is None else f"[{number(low)}, {number(high)}]"

@@ -1,1 +1,1 @@
-"""The drawings of a report that move: a policy's episode as an animation."""
+"""The page of a report: its HTML document, the runs on it, and drawings of episodes."""

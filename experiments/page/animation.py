@@ -1,6 +1,7 @@
-"""A short episode as an HTML canvas: recorded poses projected on a plane, drawn by thirty lines of script, no network.
+"""An episode as an animation on the page: recorded poses, projected on a plane, which a short script draws.
 
-No renderer is involved: without a display none of EGL, OSMesa and GLFW can be counted on.
+The page needs no network. No renderer is involved, because on a machine without a display it is not certain that EGL,
+OSMesa or GLFW works.
 """
 
 import dataclasses
@@ -49,14 +50,14 @@ _SCRIPT = """
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Poses:
-    """F frames of G line segments in a plane, in metres: x1, y1, x2, y2."""
+    """F frames of G line segments in a plane, each x1, y1, x2, y2 in metres."""
 
     frames: np.ndarray  # [F, G, 4]
     radii: np.ndarray  # [G]
     costs: np.ndarray  # [F] bool: a cost was paid in this frame
-    num_steps: int  # of the episode, which may be longer
+    num_steps: int  # steps of the episode that were recorded; the episode may be longer
     seconds_per_frame: float
-    above: bool  # the plane is the floor; otherwise it is vertical, y upwards
+    above: bool  # whether the plane is the floor; otherwise it is vertical, with y upwards
 
 
 def record_poses(env: Any, policy: NumpyPolicy, *, above: bool = False, num_steps: int = 300, seed: int = 0) -> Poses:
@@ -117,7 +118,7 @@ def play_run(run: Run, seed: int, name: str, caption: str) -> str:
 
 
 def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> np.ndarray:
-    """[G, 2, 3]: both ends of every capsule; a sphere's ends coincide."""
+    """Both ends of every geom, [G, 2, 3]: those of a capsule's axis; of a sphere both are its centre."""
     capsule = model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_CAPSULE
     half = np.where(capsule, model.geom_size[geoms, 1], 0.0)[:, None] * data.geom_xmat[geoms].reshape(-1, 3, 3)[:, :, 2]
     centre = data.geom_xpos[geoms]
@@ -125,7 +126,10 @@ def _segments(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> 
 
 
 def to_html(poses: Poses, name: str, caption: str) -> str:
-    """A figure that plays the poses in a loop, red where a cost is paid. `name` is unique on the page."""
+    """The HTML of a figure that plays the poses in a loop, in red where a cost is paid.
+
+    `name` is that of the element; no other on the page has it.
+    """
     heights = poses.frames[:, :, [1, 3]]
     extent = np.ptp(heights, axis=(1, 2)).max() if poses.above else heights.max()
     span = float(np.clip(1.5 * extent, 1.6, 8.0))  # metres from bottom to top of the canvas

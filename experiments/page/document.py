@@ -11,6 +11,7 @@ import numpy as np
 from ccil_jax.config import relevant
 from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number
 from experiments.page.entries import Entry, choose_seed
+from experiments.policies.numpy_policy import is_known
 from experiments.runs.intervals import bootstrap_interval
 
 _COLUMNS = (
@@ -46,7 +47,7 @@ code { font-size: .86rem; background: #f4f6f8; padding: .05rem .3rem; white-spac
 
 
 def is_page(path: Path) -> bool:
-    """Whether the file was written by this launcher, so that a newer page may take its place."""
+    """Whether the file is a page of a report, which a newer page may replace."""
     try:
         with path.open("rb") as file:
             return _PAGE.encode() in file.read(500)
@@ -55,7 +56,7 @@ def is_page(path: Path) -> bool:
 
 
 def draw_tasks(entries: Sequence[Entry]) -> dict[str, bytes]:
-    """The learning curves of each task, all runs overlaid: bytes of a PNG file by task, in the order of the runs."""
+    """The learning curves of all runs of a task in one figure: the bytes of a PNG file for each task."""
     from experiments.runs import figures  # imports matplotlib
 
     curves: dict[str, list[figures.Curve]] = {}
@@ -71,7 +72,14 @@ def page(
     seed: int = 0,
     player: Callable[[Entry], str] | None = None,
 ) -> str:
-    """The whole page, with a PNG for each task; `player` gives the HTML of an episode of a run, or an empty string."""
+    """The whole page.
+
+    Args:
+        entries: the runs.
+        images: a PNG file of learning curves for each task.
+        seed: of the bootstrap intervals.
+        player: makes the HTML of an episode of a run, or an empty text; None leaves episodes out.
+    """
     tasks = list(images)
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
@@ -124,7 +132,10 @@ def _metrics_table(entries: Sequence[Entry], seed: int) -> str:
 
 
 def _reference_rows(entries: Sequence[Entry]) -> Iterable[list[str]]:
-    """Label, no seeds, return and cost of what the runs are measured against: a row for each level that differs."""
+    """Rows for the expert, the random policy and the cost limit: a label, no number of seeds, return and cost.
+
+    Runs that have different levels have rows of their own.
+    """
     for name, title in (("expert", "expert"), ("random", "random policy"), ("cost_limit", "cost limit")):
         runs: dict[tuple[str, str], list[str]] = {}
         for e in entries:
@@ -139,7 +150,7 @@ def _reference_rows(entries: Sequence[Entry]) -> Iterable[list[str]]:
 
 
 def _across_tasks(entries: Sequence[Entry], seed: int) -> str:
-    """Methods that were run on several tasks: seeds are resampled within each task."""
+    """A table of the methods over all tasks; for the intervals, seeds are resampled within each task."""
     rows = []
     for method in dict.fromkeys(e.run.config.method for e in entries):
         chosen = [e for e in entries if e.run.config.method == method]
@@ -167,14 +178,14 @@ def _seed_cell(row: Mapping[str, Any], name: str) -> str:
 
 
 def _with_error(content: Mapping[str, Any], name: str) -> str:
-    """A mean and its standard error, which earlier versions did not write."""
+    """A mean and its standard error, which summaries of earlier versions lack."""
     if content.get(name) is None:
         return "-"
     return f"{number(content[name])} <small>&plusmn; {number(content.get(f'{name}_standard_error'))}</small>"
 
 
 def _marked(text: str, name: str, beyond_error: bool | None) -> str:
-    """The text of a cell; a violation that is no scatter of the demonstrations is marked."""
+    """The text of a cell. A violation that is larger than the error of the demonstrations is marked."""
     if name != "relative_cost_violation" or not beyond_error:
         return text
     return f"<span class=beyond title='{_text(BEYOND_ERROR)}'>{marked(text, beyond_error)}</span>"
@@ -225,9 +236,10 @@ def _text(value: str) -> str:
 def animate(entry: Entry) -> str:
     """The HTML of an episode of the seed with the highest return.
 
-    It is empty for a run without checkpoints, and for a task that cannot be drawn or is not known here.
+    It is empty for a run without checkpoints, for a task that cannot be drawn or is not known here, and for a policy
+    of the user's own.
     """
-    if not (entry.run.folder / "checkpoints").is_dir() or entry.view is None:
+    if not (entry.run.folder / "checkpoints").is_dir() or entry.view is None or not is_known(entry.run.config):
         return ""
     from experiments.page import animation  # imports JAX, which a page without episodes does not need
 

@@ -12,7 +12,7 @@ from experiments.runs import run_folder
 from experiments.runs.labels import distinct_names
 from experiments.runs.run_folder import Run
 
-_NEEDED = {"num_seeds", "per_seed", "env_steps", "env_steps_per_second", "expert_cost"}  # of summary.json
+_NEEDED = {"num_seeds", "per_seed", "env_steps", "env_steps_per_second", "expert_cost"}  # keys of summary.json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,8 +21,8 @@ class Entry:
 
     run: Run
     summary: dict[str, Any]
-    label: str  # no other run of this task has it
-    number: int  # no other run of this page has it
+    label: str  # differs from those of all other runs of the task
+    number: int  # differs from those of all other runs on the page
 
     @property
     def task(self) -> str:

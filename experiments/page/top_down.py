@@ -1,6 +1,6 @@
-"""A Safety Gym episode as one picture from above: the layout, the robot's way, where it paid, which goals it met.
+"""A Safety Gym episode as one picture from above: the layout, the robot's path, its costs, and the goals that it met.
 
-Drawn with matplotlib: no renderer, display or GPU is involved.
+It is drawn with matplotlib, and needs no renderer, display or GPU.
 """
 
 import dataclasses
@@ -35,9 +35,9 @@ class Episode:
     """T control steps; positions on the floor in metres."""
 
     robot: np.ndarray  # [T + 1, 2]
-    objects: dict[str, np.ndarray]  # kind -> [T + 1, count, 2]; a goal's row is the one in force after the step
+    objects: dict[str, np.ndarray]  # by kind, [T + 1, count, 2]; a goal's row is the goal that holds after the step
     costs: np.ndarray  # [T] 0 or 1
-    met: np.ndarray  # [T] bool: goal, button or push met in this step
+    met: np.ndarray  # [T] bool: whether the task's goal was met in this step
     episode_return: float
 
 
@@ -67,7 +67,7 @@ def record(env: SafetyGym, policy: NumpyPolicy, *, num_steps: int = 1000, seed: 
 
 
 def draw(env: SafetyGym, episode: Episode) -> Figure:
-    """The picture. The way is coloured by time, from dark to light; red where a cost is paid."""
+    """Draws the picture. The path is coloured by time, from dark to light; red dots show where a cost is paid."""
     with mpl.rc_context(figures.STYLE):
         figure = Figure(figsize=(7.2, 6.4), layout="constrained")
         axes = figure.add_subplot()
@@ -96,7 +96,7 @@ def _draw_arena(axes: Axes) -> None:
 
 
 def _draw_kind(axes: Axes, kind: ObjectKind, episode: Episode) -> None:
-    """Where a kind's objects start, and thinly where those that move went."""
+    """Draws where the objects of a kind start and, as thin lines, the paths of those that can move."""
     color, places = _COLORS[kind.name], episode.objects[kind.name]
     label: str | None = kind.name.replace("_", " ")
     if kind.name == "goal":

@@ -1,1 +1,1 @@
-"""Learnt policies outside JAX: in the original simulators, and as files for other programs."""
+"""Learnt policies at work: evaluation in our simulators and the original ones, and files for other programs."""

@@ -1,4 +1,4 @@
-"""Fresh episodes of a finished run's policies, in our simulator or the original one, and what they say of the run."""
+"""Evaluates a finished run: its policies play fresh episodes, in our simulator or in the original one."""
 
 import dataclasses
 from typing import Any
@@ -12,7 +12,7 @@ from experiments.runs.run_folder import Run
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """How a run is evaluated. The fields stand in the result file under these names."""
+    """How a run is evaluated. The result file has these fields under the same names."""
 
     simulator: str  # one of `evaluations.SIMULATORS`
     num_episodes: int  # of each seed
@@ -88,7 +88,7 @@ def judge(loaded: Loaded, settings: Settings, episodes: Any) -> tuple[dict[str, 
 
 
 def facts_of(loaded: Loaded, settings: Settings) -> dict[str, Any]:
-    """What a file of exported policies says about the episodes that it is written with."""
+    """The metadata of exported policies, which says how the episodes in the file were played."""
     return {
         "task": loaded.task.name,
         "original": loaded.task.original,

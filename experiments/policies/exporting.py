@@ -1,4 +1,4 @@
-"""Learnt policies for programs that do not know this one: as NumPy arrays, or as a StableHLO program."""
+"""Files of learnt policies for other programs: NumPy arrays, or a StableHLO program."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 
 
 def export_numpy(path: Path, config: Config, actor: Any, env: Any, evaluation: Any, facts: dict[str, Any]) -> None:
-    """Writes every seed's policy as NumPy arrays [num_seeds]-leading, with what it achieved here.
+    """Writes the policies of all seeds as NumPy arrays, [num_seeds]-leading, and the results of their episodes.
 
     Args:
         path: an `.npz` file.
@@ -37,7 +37,7 @@ def export_numpy(path: Path, config: Config, actor: Any, env: Any, evaluation: A
 
 
 def export_stablehlo(path: Path, config: Config, actor: Any, env: Any) -> None:
-    """Writes all seeds' policies, parameters included, as one program for any number N of observations.
+    """Writes the policies of all seeds, with their parameters, as one program for any number N of observations.
 
     `jax.export.deserialize(bytearray(path.read_bytes())).call(obs, noise)` maps observations [N, obs_dim] and standard
     normal noise [N, action_dim], float32, to actions [num_seeds, N, action_dim], not yet clipped to the task's range;

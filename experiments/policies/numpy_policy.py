@@ -18,10 +18,21 @@ _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-class NumpyPolicy:
-    """The forward pass of one seed's policy; `actor` is that seed's `ccil_jax.acting.rollout.Actor` (no seed axis).
+def is_known(config: Config) -> bool:
+    """Whether this file can compute the policy of a method: it is one of this package, not one of the user's own."""
+    return config.row.policy in ("gaussian", "squashed")
 
-    A squashed policy (IQ-Learn) maps into the range of actions [low, high]; a Gaussian one has to be clipped to it.
+
+class NumpyPolicy:
+    """The forward pass of the policy of one seed, in float64.
+
+    Args:
+        config: of the policy.
+        actor: the seed's `ccil_jax.acting.rollout.Actor`, without a seed axis.
+        low: lower bounds of the actions, [action_dim].
+        high: upper bounds of the actions, [action_dim].
+
+    The actions of a squashed policy (IQ-Learn) lie between the bounds; those of a Gaussian one have to be clipped.
     """
 
     def __init__(self, config: Config, actor: Any, low: np.ndarray, high: np.ndarray) -> None:
@@ -44,7 +55,7 @@ class NumpyPolicy:
             self._log_std = np.asarray(actor.policy_params["log_std"], np.float64)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What `tests/golden/run_policy.py` computes it from where JAX cannot be installed."""
+        """The arrays from which another program can compute the policy; `tests/golden/run_policy.py` is an example."""
         layers = {f"{name}_{i}": x for i, pair in enumerate(self._layers) for name, x in zip(_LAYER, pair, strict=True)}
         if self._squashed:
             last = {"action_center": self._center, "action_half_range": self._half_range}
@@ -53,11 +64,11 @@ class NumpyPolicy:
         return layers | last | {"obs_mean": self._mean, "obs_std": self._std, "obs_clip": np.asarray(self._clip)}
 
     def mode(self, obs: np.ndarray) -> np.ndarray:
-        """[obs_dim] -> [action_dim], the action of no noise."""
+        """The mode of the policy: [obs_dim] -> [action_dim], the action without noise."""
         return self._act(obs, np.zeros(len(self._center)))
 
     def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        """[obs_dim] -> [action_dim], drawn from the policy."""
+        """An action drawn from the policy: [obs_dim] -> [action_dim]."""
         return self._act(obs, random.standard_normal(len(self._center)))
 
     def _act(self, obs: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -75,7 +86,7 @@ class NumpyPolicy:
 
 
 def policies(config: Config, actor: Any, env: Any) -> list[NumpyPolicy]:
-    """Every seed's policy; `actor` is [num_seeds]-leading."""
+    """The policies of all seeds; `actor` is [num_seeds]-leading."""
     import jax
 
     low, high = np.asarray(env.action_low, np.float64), np.asarray(env.action_high, np.float64)

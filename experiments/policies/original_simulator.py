@@ -1,6 +1,6 @@
-"""Episodes of a learnt policy in gymnasium's own `-v5` simulator: one process, NumPy only, none of our physics.
+"""Episodes of a learnt policy in gymnasium's own `-v5` environments, in one process and without our physics.
 
-Reward and cost follow the task's rule (`envs.locomotion`), fed with the reward terms that gymnasium reports.
+Reward and cost are computed by the task's rule (`envs.locomotion`) from the reward terms that gymnasium reports.
 """
 
 import dataclasses
@@ -41,9 +41,9 @@ def evaluate(
     draws: Sequence[int] | None = None,
     contact_cost: bool = True,
 ) -> Totals:
-    """As `ccil_jax.acting.evaluation.evaluate`, in gymnasium's simulator. `actor` is [num_seeds]-leading.
+    """The same as `ccil_jax.acting.evaluation.evaluate`, in gymnasium's simulator. `actor` is [num_seeds]-leading.
 
-    `contact_cost` is the option of that name which `env` was made with.
+    `contact_cost` is the option of that name with which `env` was made.
     """
     simulator, learnt, results = make_simulator(env), policies(config, actor, env), []
     for draw, policy in zip(range(len(learnt)) if draws is None else draws, learnt, strict=True):
@@ -58,7 +58,7 @@ def evaluate(
 
 
 def make_simulator(env: Any) -> Any:
-    """Gymnasium's own environment of `env`'s task, with the same observations and time limit."""
+    """Gymnasium's own environment of the task of `env`, with the same observations and time limit."""
     import gymnasium
 
     task = TASKS[env.name]

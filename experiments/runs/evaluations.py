@@ -1,4 +1,4 @@
-"""The file `evaluation.json`: the newest evaluation in each simulator and, under `earlier`, all those before them.
+"""The file `evaluation.json`: the newest evaluation in each simulator and, under `earlier`, all older ones.
 
 {"ours": {"num_episodes": 50, "seed": 1, "deterministic": false, ..., "per_seed": [...]},
  "original": {...},
@@ -45,9 +45,9 @@ def _holds_evaluations(content: Any) -> bool:
 
 
 def add(path: Path, evaluation: Mapping[str, Any]) -> None:
-    """Writes `evaluation`, which holds all of `SETTINGS`, into `path`; what was there is kept.
+    """Adds `evaluation`, which has all keys of `SETTINGS`, to the file `path` and keeps the evaluations there.
 
-    Only an evaluation with the same settings and the same results is replaced. Other processes may add to the file at
+    Only an evaluation with the same settings and the same results is replaced. Several processes may add to the file at
     the same time.
     """
     with filesystem.hold(path.with_name(f".{path.name}.lock"), wait=True):

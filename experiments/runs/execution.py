@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ccil_jax.config import Config
 from ccil_jax.training import filesystem
-from ccil_jax.training.filesystem import file_sha256
 from ccil_jax.training.progress import Display
-from experiments.cli import options, xla
+from experiments.cli import xla
 from experiments.cli.interruption import Interruption
 from experiments.runs import fault_files, run_folder, summary
+from experiments.runs.metrics_file import read_metrics
 from experiments.runs.plans import ProgramPlan, RunPlan, Setup
+from experiments.runs.run_log import RunLog, write_config
 
 if TYPE_CHECKING:
     from ccil_jax.acting.evaluation import Evaluation
@@ -78,7 +78,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         }
         for plan in todo.values():
             if not plan.resume:  # of a resumed run it is written once it is certain that the run goes on
-                run_folder.write_config(plan.folder, plan.config, _facts(plan, env))
+                write_config(plan, env)
         results, rate = _train(program, todo, env, display, interruption)
         trained = [(plan, results[i]) for i, plan in todo.items()]
         for plan, result in trained:
@@ -115,49 +115,6 @@ def _with_earlier_commands(plan: RunPlan) -> RunPlan:
     return dataclasses.replace(plan, command="\n".join([*earlier, plan.command]))
 
 
-class _Recorder:
-    """Writes what the training reports into the folders of its runs, and measures its speed.
-
-    Args:
-        config: the static fields of all runs.
-        runs: each run that is to be recorded, with its columns in the reported metrics [iterations, num_runs].
-        env: the task that the runs are trained on.
-        stack: closes the files.
-    """
-
-    def __init__(
-        self, config: Config, runs: Sequence[tuple[RunPlan, slice]], env: Any, stack: contextlib.ExitStack
-    ) -> None:
-        self._steps_per_iteration = config.steps_per_iteration
-        self._plans, self._env = [plan for plan, _ in runs], env
-        self._writers = [
-            (stack.enter_context(run_folder.MetricsWriter(plan.folder)), columns) for plan, columns in runs
-        ]
-        self._steps = self._seconds = 0.0
-
-    def begin(self, history: "History") -> None:
-        """Before the first iteration; `history` has the metrics of those that an earlier process has done."""
-        for plan in self._plans:
-            if plan.resume:
-                run_folder.write_config(plan.folder, plan.config, _facts(plan, self._env))
-        for writer, columns in self._writers:
-            writer.begin({name: rows[:, columns] for name, rows in history.items()})
-
-    def write(self, progress: "Progress") -> None:
-        """After each chunk of iterations."""
-        steps = progress.metrics["env_steps"].size * self._steps_per_iteration
-        self._steps += steps
-        if steps:  # behaviour cloning takes none
-            self._seconds += steps / progress.env_steps_per_second
-        for writer, columns in self._writers:
-            writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
-
-    @property
-    def env_steps_per_second(self) -> float | None:
-        """Of all runs together, without compilation; None where no step was taken."""
-        return self._steps / self._seconds if self._seconds else None
-
-
 def _train(
     program: ProgramPlan, todo: Mapping[int, RunPlan], env: Any, display: Display, interruption: Interruption
 ) -> tuple[list["Result"], float | None]:
@@ -171,14 +128,14 @@ def _train(
     setup, config = program.setup, program.config
     columns = combining.columns(len(program.runs), setup.num_seeds)
     with contextlib.ExitStack() as stack:
-        recorder = _Recorder(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
+        log = RunLog(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
 
         def on_start(history: "History") -> None:
-            recorder.begin(history)
+            log.begin(history)
             interruption.defer()
 
         def on_progress(progress: "Progress") -> None:
-            recorder.write(progress)
+            log.write(progress)
             display.update(progress)
 
         results = runner.train_runs(
@@ -200,7 +157,7 @@ def _train(
     for i, plan in todo.items():
         if (directory := plan.folder / "checkpoints") != program.checkpoint_dir:
             runner.save(results[i], directory)
-    return results, recorder.env_steps_per_second
+    return results, log.env_steps_per_second
 
 
 def _evaluate(setup: Setup, results: Sequence["Result"], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:
@@ -218,35 +175,6 @@ def _evaluate(setup: Setup, results: Sequence["Result"], env: Any) -> tuple[list
     own = combining.columns(len(results), setup.num_seeds)
     evaluations = [jax.tree.map(lambda leaf, rows=rows: leaf[rows], together) for rows in own]
     return evaluations, evaluation.random_policy(env, **settings)
-
-
-def _facts(plan: RunPlan, env: Any) -> dict[str, Any]:
-    """What config.json says besides the hyperparameters."""
-    import jax
-
-    setup, demonstrations = plan.setup, None
-    if setup.demonstrations_path is not None:
-        demonstrations = {
-            "file": str(setup.demonstrations_path.resolve()),
-            "sha256": file_sha256(setup.demonstrations_path),
-            "num_episodes": setup.num_demonstrations,
-        }
-    device = jax.devices()[0]
-    return {
-        "task": setup.task,
-        "physics": options.engine_of(setup.task, env),
-        "env_options": setup.env_options,
-        "preset": plan.preset,
-        "command": plan.command,
-        "seed": setup.seed,
-        "one_by_one": setup.one_by_one,
-        "num_seeds": setup.num_seeds,
-        "eval_episodes": setup.eval_episodes,
-        "demonstrations": demonstrations,
-        **summary.expert_levels(setup.demonstrations),
-        "expert_length": setup.demonstrations.mean_episode_length if setup.demonstrations else None,
-        "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
-    }
 
 
 def _finish(
@@ -267,7 +195,7 @@ def _finish(
     reference = summary.make_reference(
         summary.expert_levels(setup.demonstrations), random, plan.config.prescribed_limit
     )
-    metrics = run_folder.read_metrics(plan.folder)
+    metrics = read_metrics(plan.folder)
     rows = summary.per_seed_scores(evaluated, metrics["cost_rate"][-1] if "cost_rate" in metrics else None, reference)
     aggregate = summary.aggregate_scores(rows)
     content = {

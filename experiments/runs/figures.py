@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from experiments.runs import run_folder
 from experiments.runs.intervals import known_deviation, known_mean
 from experiments.runs.labels import literal
+from experiments.runs.metrics_file import read_metrics
 
 PANELS = (
     ("episode_return", "Return"),
@@ -27,7 +28,7 @@ CLONING_PANELS = (  # of a method that does not act while it learns
     ("held_out_loss", "Loss on held-out steps, nats"),
 )
 _DEMONSTRATIONS, _ERROR, _LIMIT = _LEVEL_LABELS = ("mean of the demonstrations", "its standard error", "cost limit")
-_MAX_POINTS = 100  # of a curve: few episodes end in an iteration, and their scatter would hide the learning
+_MAX_POINTS = 100  # of a curve. Few episodes end in an iteration, so that single iterations scatter too much
 COLORS = ("#0b6e99", "#d1495b", "#6a994e", "#e09f3e", "#7b5ea7", "#3d405b", "#00a5a5", "#a44a3f")
 STYLE: Any = {
     "font.family": "DejaVu Sans",
@@ -65,7 +66,7 @@ class Curve:
 
     @property
     def window(self) -> int:
-        """Iterations behind one point of the curve."""
+        """Iterations that one point of the curve is a mean of."""
         return -(-len(self.metrics["env_steps"]) // _MAX_POINTS)
 
 
@@ -75,7 +76,7 @@ def read_curve(folder: Path, label: str | None = None) -> Curve:
     cost, length = run.facts["expert_cost"], run.facts["expert_length"]
     return Curve(
         label=label or run.config.method,
-        metrics=run_folder.read_metrics(folder),
+        metrics=read_metrics(folder),
         expert_levels={
             "episode_return": run.facts["expert_return"],
             "episode_cost": cost,
@@ -104,12 +105,12 @@ def draw_run(folder: Path) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """One metric of those runs that have it and whose iterations are of one kind: they share an axis."""
+    """One metric, of the runs that have it and that count on the same axis (environment steps, or passes)."""
 
     metric: str
     title: str
-    curves: Mapping[int, Curve]  # by their place among all curves, which decides on their colour
-    by_passes: bool  # over the demonstrations; the others take environment steps
+    curves: Mapping[int, Curve]  # by their index among all curves, which decides on the colour
+    by_passes: bool  # whether the axis counts passes over the demonstrations; otherwise it counts environment steps
 
 
 def panels_of(curves: Sequence[Curve]) -> list[Panel]:
@@ -130,7 +131,8 @@ def draw_panels(curves: Sequence[Curve], task: str, names: Sequence[str] | None 
     panels = [panel for panel in panels_of(curves) if names is None or panel.metric in names]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.1 * len(panels) + 0.3, 3.9), dpi=150, layout="constrained")
-        entries: dict[str, Any] = {}  # of the legend: explicit, as matplotlib hides labels with a leading underscore
+        # Matplotlib leaves labels with a leading underscore out of a legend, unless its entries are listed explicitly.
+        entries: dict[str, Any] = {}
         for axes, panel in zip(np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True):
             entries = _draw_panel(axes, panel) | entries
         _decorate(figure, curves, task)
@@ -153,7 +155,10 @@ def html_image(image: bytes, text: str) -> str:
 
 
 def binned(values: np.ndarray, window: int) -> np.ndarray:
-    """Means over `window` rows in turn, the last over what is left: [T, ...] -> [ceil(T / window), ...]; NaN stays."""
+    """Means over every `window` rows, the last over the remaining rows: [T, ...] -> [ceil(T / window), ...].
+
+    A mean over rows with a NaN is NaN.
+    """
     starts = np.arange(0, len(values), window)
     counts = np.diff([*starts, len(values)]).reshape(-1, *[1] * (values.ndim - 1))
     means: np.ndarray = np.add.reduceat(values, starts, axis=0, dtype=np.float64) / counts
@@ -203,7 +208,7 @@ def _draw_levels(axes: Axes, curves: Sequence[Curve], name: str) -> dict[str, An
         line = axes.axhline(limit, color="#a0281f", linewidth=1.3, linestyle=(0, (1, 2)))
         entries.setdefault(_LIMIT, line)
     if name in ("episode_cost", "cost_rate"):
-        axes.set_ylim(bottom=0.0)  # costs are not negative, and a band below zero would mislead
+        axes.set_ylim(bottom=0.0)  # costs are never negative, so that a band below zero would be misleading
     return entries
 
 

@@ -1,6 +1,6 @@
 """Aggregates over seeds: interquartile mean with a stratified bootstrap interval (Agarwal et al. 2021). NumPy only.
 
-Our own few lines because rliable cannot be imported beside pandas 3. What the numbers mean: docs/metrics.md.
+These lines are our own because rliable does not work with pandas 3. docs/metrics.md says what the numbers mean.
 """
 
 import dataclasses
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-MIN_SEEDS = 3  # of an interval: resamples of one or two values say next to nothing of what further seeds would do
+MIN_SEEDS = 3  # of an interval: resamples of one or two values say almost nothing about further seeds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Interval:
 
 
 def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of what is left after dropping floor(n / 4) values at each end of the sorted `values [n]`, n >= 1."""
+    """Mean of the sorted `values [n]`, n >= 1, without the floor(n / 4) smallest and the floor(n / 4) largest."""
     ordered = np.sort(np.asarray(values, np.float64), axis=None)
     cut = len(ordered) // 4
     return float(np.mean(ordered[cut : len(ordered) - cut]))
@@ -36,11 +36,20 @@ def bootstrap_interval(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """`statistic` of all values and its percentile interval; values are resampled within each stratum (task).
+    """A statistic of all values and its percentile bootstrap interval.
 
-    `strata` is one array of values (one per seed) per task. The seed is fixed, so a report can be made again. Where a
-    stratum has fewer than `MIN_SEEDS` values there is a value, but no interval.
-    Raises `ValueError` for an empty stratum or a value that is not finite.
+    Args:
+        strata: an array of values (one per seed) for each task. Values are resampled within each of these strata.
+        statistic: of an array [n].
+        confidence: of the interval.
+        num_resamples: of the bootstrap.
+        seed: of the resampling, so that the same values have the same interval.
+
+    Returns:
+        The value and its interval; without an interval if a stratum has fewer than `MIN_SEEDS` values.
+
+    Raises:
+        ValueError: a stratum is empty, or a value is not finite.
     """
     arrays = [np.asarray(stratum, np.float64).ravel() for stratum in strata]
     if not arrays or any(a.size == 0 for a in arrays):

@@ -1,19 +1,16 @@
-"""Names as data: runs get labels that tell them apart, and no name is taken for markup."""
+"""Labels of runs: names that differ, drawn as they are written."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 
 def literal(text: str) -> str:
-    """A text that matplotlib draws as it is: no mathematics between dollars, no characters without a shape.
-
-    A label that begins with an underscore is left out of legends unless it is handed to `legend` itself.
-    """
+    """The text for matplotlib, which draws it as it is: dollar signs are escaped, unprintable characters are `?`."""
     return "".join(c if c.isprintable() else "?" for c in text).replace("$", r"\$")
 
 
 def distinct_names(folders: Sequence[Path]) -> list[str]:
-    """For each of several different folders the shortest end of its real path that none of the others has."""
+    """A name for each of several folders: the shortest end of its real path in which it differs from all others."""
     parts = [folder.resolve().parts for folder in folders]
 
     def shared(own: tuple[str, ...], length: int) -> bool:

@@ -15,7 +15,7 @@ from envs.registry import TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 
-_EVALUATION_SEED_OFFSET = 10_000_019  # keeps evaluation episodes apart from training with the same --seed
+_EVALUATION_SEED_OFFSET = 10_000_019  # so that evaluation draws other random numbers than training with the same --seed
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -208,11 +208,12 @@ def find_demonstrations(
         path = _shipped(task.name)
     demonstrations = load(path)
     check_matches(demonstrations, path, task)
-    for name, used in env_options.items():  # the expert's cost means nothing under another definition of cost
+    for name, used in env_options.items():  # with another definition of the cost, the expert's cost would be no limit
         recorded = demonstrations.metadata.get(name, used)
         if recorded != used:
             option = f"--{name.replace('_', '-')} {recorded}".lower()
-            raise UsageError(f"{path}: recorded with {name} {recorded}, this run has {used}; use {option}")
+            remedy = f"use {option}" if name in options.TASK_OPTIONS else "use demonstrations of the task as it is now"
+            raise UsageError(f"{path}: recorded with {name} {recorded}, this run has {used}; {remedy}")
     if count is not None and count > demonstrations.num_episodes:
         raise UsageError(f"--num-demos {count}: {path} holds {demonstrations.num_episodes}; give at most that many")
     if count is not None:

@@ -1,4 +1,4 @@
-"""Demonstrations of a finished run's policy: whose they are, and what their file says about it."""
+"""Demonstrations by the policy of a finished run: which seed is recorded, and what the file says about it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,14 +16,14 @@ _SCORES = ("episode_return", "episode_cost", "episode_length")
 
 
 def cost_limit(run: Run) -> float | None:
-    """The episode cost that the run's method had to keep; None for a method without a limit."""
+    """The limit of the episode cost in the training of a run; None for a method without a limit."""
     limits = {"prescribed": run.config.cost_limit, "demonstrations": run.facts["expert_cost"], None: None}
     limit: float | None = limits[run.config.row.limit]
     return limit
 
 
 def choose_seed(rows: Sequence[dict[str, Any]], cost_limit: float | None) -> int | None:
-    """The seed with the highest return among those within the limit; None if there is none."""
+    """The seed with the highest mean return among those whose mean cost is within the limit; None if there is none."""
     allowed = [row for row in rows if cost_limit is None or row["episode_cost"] <= cost_limit]
     return max(allowed, key=lambda row: row["episode_return"])["seed"] if allowed else None
 
@@ -53,7 +53,7 @@ def find_seed(run: Run, rows: Sequence[dict[str, Any]], seed_index: int | None) 
 
 
 def read_summary(run: Run) -> dict[str, Any]:
-    """What a finished run achieved. Raises `UsageError` if the run is not finished."""
+    """The content of the run's summary.json. Raises `UsageError` if the run is not finished or the file is damaged."""
     path = run.folder / "summary.json"
     unfinished = f"--record: the run in {run.folder} is not finished; continue it with --resume"
     if not path.is_file():
@@ -73,7 +73,14 @@ def read_summary(run: Run) -> dict[str, Any]:
 
 
 def facts(run: Run, summary: Mapping[str, Any], seed_index: int, command: str) -> dict[str, Any]:
-    """What a reader of the demonstrations needs to know; `command` is what made them, one command a line."""
+    """The metadata of demonstrations by one seed of a run.
+
+    Args:
+        run: of the policy.
+        summary: the content of its summary.json.
+        seed_index: the seed.
+        command: the commands that made the demonstrations, one a line.
+    """
     (row,) = [row for row in summary["per_seed"] if row["seed"] == seed_index]
     limit = cost_limit(run)
     return {
@@ -97,7 +104,16 @@ def facts(run: Run, summary: Mapping[str, Any], seed_index: int, command: str) -
 def record(
     config: Config, agents: Any, env: Any, *, num_trajectories: int, episode_seed: int, facts: Mapping[str, Any]
 ) -> Demonstrations:
-    """Rolls out the policy of the seed that `facts` names; `agents` is [num_seeds]-leading."""
+    """Records episodes of one seed's policy.
+
+    Args:
+        config: of the policies.
+        agents: the policies of all seeds, [num_seeds]-leading.
+        env: the task.
+        num_trajectories: episodes to record.
+        episode_seed: of the episodes.
+        facts: the metadata; its `seed_index` says which seed acts.
+    """
     import jax
 
     from ccil_jax.acting import evaluation
@@ -113,7 +129,7 @@ def record(
 
 
 def print_demonstrations(demonstrations: Demonstrations, path: Path) -> None:
-    """One table: each recorded trajectory's length, return and cost, and their means beside the limit."""
+    """Prints a table: length, return and cost of each recorded trajectory, their means, and the limit."""
     from rich.table import Table
 
     returns = demonstrations.episode_returns

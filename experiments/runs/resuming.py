@@ -1,4 +1,4 @@
-"""What `--resume` needs to know: the choices of the run in a folder, and that the options given agree with them."""
+"""For `--resume`: reads the options of the run in a folder and checks that the options given agree with them."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -14,9 +14,16 @@ from experiments.runs import run_folder
 def resumed(
     folder: Path | None, given: Mapping[str, Any], option: str = "--out", movable: Collection[str] = ()
 ) -> dict[str, Any]:
-    """The choices of the run in `folder`, with `demos` as a path. Raises `UsageError` where `given` disagrees.
+    """The options of the run in `folder`, by name; `demos` is a path.
 
-    `env_steps` may differ, upwards, as a finished run can be trained for longer, and so may the fields `movable`.
+    Args:
+        folder: of the run.
+        given: the options that a person gave. `env_steps` may be larger than before, which trains the run for longer.
+        option: names the folder in error messages.
+        movable: fields of `Config` that may differ, too.
+
+    Raises:
+        UsageError: there is no run, or an option in `given` differs from that of the run.
     """
     if folder is None:
         raise UsageError(f"--resume: needs {option} with the folder of the run to continue")
@@ -28,20 +35,20 @@ def resumed(
         **relevant(run.config),
         **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
         "one_by_one": run.facts.get("one_by_one", False),  # older runs do not say
-        **dict.fromkeys(options.TASK_OPTIONS),  # where the task has none; else:
+        **dict.fromkeys(options.TASK_OPTIONS),  # None where the task has no such option; otherwise:
         **run.facts["env_options"],
         "env": run.facts["task"],
         "num_demos": demos["num_episodes"] if demos else None,
     }
     for name, value in given.items():
-        if name in ("demos", *movable) or name not in saved:  # what makes no difference to the run is refused later
+        if name in ("demos", *movable) or name not in saved:  # an option without effect is refused later
             continue
         longer = name == "env_steps" and value > saved[name]
         if value != saved[name] and not longer:
             raise UsageError(
                 f"--{name.replace('_', '-')} {value}: the run in {folder} has {saved[name]}; leave it out to resume"
             )
-    # A file that was moved may be named again: its digest decides.
+    # The file may have been moved. It is the same file if its digest is the same.
     path: Path | None = given.get("demos", Path(demos["file"]) if demos else None)
     if path and path.is_file() and demos and file_sha256(path) != demos["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")

@@ -1,62 +1,26 @@
-"""The folder of one training run: config, metrics, summary, checkpoints, figures, TensorBoard events."""
+"""The folder of one training run, and its files config.json and summary.json.
 
-import contextlib
-import csv
+A run folder has config.json, metrics.csv, summary.json, checkpoints, figures and TensorBoard events.
+"""
+
 import dataclasses
 import json
 import math
 import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TextIO
+from typing import Any
 
 import numpy as np
 
 from ccil_jax.config import Config, check_types
 from ccil_jax.errors import ConfigError
-from ccil_jax.training.history import without_unknown
 from ccil_jax.training.versions import versions
 from envs import registry
 from envs.registry import TASKS, TaskInfo
 from experiments.cli.command_line import UsageError
-from experiments.runs.intervals import known_mean
 from experiments.runs.provenance import git_commit
 
-METRICS = (  # order of the columns; a method leaves out those that it lacks
-    "env_steps",
-    "episode_return",
-    "episode_cost",
-    "cost_rate",
-    "episode_length",
-    "episodes_finished",
-    "multiplier",
-    "cost_weight",
-    "meta_gradient",
-    "kl",
-    "surrogate",
-    "step_fraction",
-    "rejected_not_finite",
-    "rejected_by_kl",
-    "rejected_by_surrogate",
-    "no_direction",
-    "entropy",
-    "imitation_reward",
-    "discriminator_loss",
-    "discriminator_accuracy_expert",
-    "discriminator_accuracy_learner",
-    "discriminator_accuracy_held_out",
-    "reward_critic_loss",
-    "cost_critic_loss",
-    "critic_loss",
-    "policy_loss",
-    "recovered_reward_expert",
-    "recovered_reward_learner",
-    "loss",
-    "held_out_loss",
-    "skipped_updates",
-)
 _FACTS = frozenset(
     {"task", "physics", "env_options", "preset", "seed", "num_seeds", "eval_episodes", "demonstrations"}
     | {"expert_return", "expert_cost", "expert_length"}
@@ -64,7 +28,7 @@ _FACTS = frozenset(
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes strict JSON, whole or not at all; numbers that are not finite become null."""
+    """Writes strict JSON: numbers that are not finite become null. The file is replaced as a whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     temporary.write_text(json.dumps(_plain(content), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     temporary.replace(path)
@@ -97,7 +61,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What config.json says."""
+    """The content of a run's config.json."""
 
     folder: Path
     config: Config
@@ -111,7 +75,15 @@ def read_run(folder: Path) -> Run:
 
 
 def parse_run(path: Path, facts: dict[str, Any]) -> Run:
-    """What the content of a config.json says; `path` is where it came from. Raises `UsageError`."""
+    """The run that the content of a config.json describes.
+
+    Args:
+        path: of the file that has the content; its folder is that of the run.
+        facts: the content; `config` is taken out of it.
+
+    Raises:
+        UsageError: a key is missing or unknown, or a value has a wrong type.
+    """
     fields = facts.pop("config", None)
     names = {f.name for f in dataclasses.fields(Config)}
     if not isinstance(fields, dict) or not _FACTS.issubset(facts):
@@ -152,105 +124,7 @@ def was_continued(run: Run, summary: Mapping[str, Any]) -> bool:
 
 
 def write_config(folder: Path, config: Config, facts: Mapping[str, Any]) -> None:
-    """config.json: `facts` (task, physics, command, seeds, demonstrations, device), versions, and every field."""
+    """Writes config.json: `facts` (task, physics, command, seeds, ...), versions, commit, and all hyperparameters."""
     made_by = {"versions": versions(), "git_commit": git_commit()}
     content = {**facts, **made_by, "config": dataclasses.asdict(config)}
     write_json(folder / "config.json", content)
-
-
-def read_metrics(folder: Path) -> dict[str, np.ndarray]:
-    """metrics.csv as `{name: [num_iterations, num_seeds]}`; NaN where a value is unknown.
-
-    Raises `UsageError` if the file is missing or ragged.
-    """
-    path = folder / "metrics.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.reader(file)
-            names = next(reader)
-            table = np.array([[float(x) if x else math.nan for x in row] for row in reader], np.float64)
-        num_seeds = int(table[:, 1].max()) + 1
-        shaped = table.reshape(-1, num_seeds, len(names))
-    except (OSError, StopIteration, ValueError, IndexError):
-        raise UsageError(f"{path}: missing, empty or damaged; give a run folder with at least one iteration") from None
-    metrics = {name: shaped[:, :, i] for i, name in enumerate(names) if name not in ("iteration", "seed")}
-    return without_unknown(metrics)  # earlier versions wrote numbers before there were any
-
-
-class MetricsWriter:
-    """Writes metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager.
-
-    A value that is unknown (NaN) is an empty field of the file, and is left out of the events.
-    `begin` first: the file then holds exactly the iterations that the run goes on from, whatever a killed process left.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        # Here: it imports protobuf, which no argument error should wait for. Not `SummaryWriter`: its thread dies of a
-        # full disk in silence, and the training waits for it for ever.
-        from tensorboardX.event_file_writer import EventsWriter
-
-        self.path = folder / "metrics.csv"
-        self._events: Any = EventsWriter(str(folder / "events"))
-        self._names: list[str] = []
-
-    def begin(self, history: Mapping[str, np.ndarray]) -> None:
-        """Replaces the file by the rows `[iterations, num_seeds]` of a checkpoint; none for a new run."""
-        temporary = self.path.with_name(".metrics.csv.tmp")
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            if history:
-                self._append(file, history, first=0)
-        temporary.replace(self.path)
-
-    def write(self, iteration: int, metrics: Mapping[str, np.ndarray]) -> None:
-        """Adds rows `[chunk, num_seeds]`; `iteration` is the number of iterations finished with the chunk's last."""
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            first = iteration - len(metrics["env_steps"])
-            rows = self._append(file, metrics, first)
-        try:
-            for number, row in enumerate(rows, first + 1):
-                self._write_events(number, row)
-            self._events.flush()
-        except OSError as error:  # tensorboardX does not name the file
-            raise OSError(error.errno, error.strerror, str(self.path.parent)) from error
-
-    def _append(self, file: TextIO, metrics: Mapping[str, np.ndarray], first: int) -> np.ndarray:
-        writer = csv.writer(file, lineterminator="\n")
-        if not self._names:
-            known = [name for name in METRICS if name in metrics]
-            self._names = known + sorted(set(metrics) - set(known))
-            writer.writerow(["iteration", "seed", *self._names])
-        rows = np.stack([np.asarray(metrics[name], np.float64) for name in self._names], axis=-1)
-        for number, row in enumerate(rows, first + 1):
-            writer.writerows([number, s, *(_text(x) for x in values)] for s, values in enumerate(row))
-        return rows
-
-    def _write_events(self, iteration: int, row: np.ndarray) -> None:
-        from tensorboardX.proto.event_pb2 import Event
-        from tensorboardX.proto.summary_pb2 import Summary
-
-        # Behaviour cloning takes no environment steps: its axis is the number of passes.
-        steps = int(row[0, self._names.index("env_steps")]) or iteration
-        means = known_mean(row, axis=0)
-        values = [
-            Summary.Value(tag=f"{group}/{name}", simple_value=numbers[i])
-            for i, name in enumerate(self._names)
-            for group, numbers in (("mean", means), *((f"seed_{s}", numbers) for s, numbers in enumerate(row)))
-            if name != "env_steps" and not math.isnan(numbers[i])
-        ]
-        self._events.write_event(Event(wall_time=time.time(), step=steps, summary=Summary(value=values)))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with contextlib.suppress(OSError):  # what `write` had to say of a full disk is said
-            self._events.close()
-
-
-def _text(value: float) -> str:
-    """Nine digits tell float32 numbers apart; counters are written in full, and nothing for what is unknown."""
-    if math.isnan(value):
-        return ""
-    return str(int(value)) if value.is_integer() and abs(value) < 2**53 else f"{value:.9g}"

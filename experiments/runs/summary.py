@@ -1,4 +1,4 @@
-"""A finished run in numbers and as a terminal table. What the numbers mean: docs/metrics.md."""
+"""The scores of a finished run, and their table in the terminal. docs/metrics.md says what the numbers mean."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ SCORES = (
     "episode_length",
 )
 NO_INTERVAL = f"no interval below {MIN_SEEDS} seeds"
-_MAX_RELATIVE_VIOLATION = 5.0  # caps the penalty: one diverged seed must not decide a mean
+_MAX_RELATIVE_VIOLATION = 5.0  # caps the penalty, so that a single diverged seed does not decide the mean
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reference:
-    """What a run is measured against. None where it is not known (no demonstrations, no limit, a single episode)."""
+    """The levels that a run is compared with. None: not known (no demonstrations, no limit, or a single episode)."""
 
     expert_return: float | None  # R_E
     expert_cost: float | None  # J_E
@@ -40,11 +40,11 @@ class Reference:
 
     @property
     def allowed_cost(self) -> float | None:
-        """The level that violations are counted from: J_E, or the prescribed limit where there is no expert."""
+        """The cost above which there is a violation: J_E, or the prescribed limit where there is no expert."""
         return self.cost_limit if self.expert_cost is None else self.expert_cost
 
     def recovered_return(self, episode_return: float) -> float | None:
-        """A return in per cent on the scale from R_0 to R_E; None where there is no such scale."""
+        """100 (R - R_0) / (R_E - R_0), in per cent, for a return R; None where R_E is unknown or equals R_0."""
         if self.expert_return is None or self.expert_return == self.random_return:
             return None
         return 100 * (episode_return - self.random_return) / (self.expert_return - self.random_return)
@@ -67,10 +67,10 @@ def expert_levels(demonstrations: Demonstrations | None) -> dict[str, float | No
 
 
 def make_reference(levels: Mapping[str, Any], random: Any, cost_limit: float | None) -> Reference:
-    """The levels of a run.
+    """The levels that a run is compared with.
 
     Args:
-        levels: what `expert_levels` says, or the content of a config.json; earlier versions wrote no standard errors.
+        levels: from `expert_levels`, or the content of a config.json; earlier versions wrote no standard errors there.
         random: evaluation of the random policy, with arrays [1, num_episodes].
         cost_limit: the prescribed limit, where the method has one.
     """
@@ -88,7 +88,7 @@ def make_reference(levels: Mapping[str, Any], random: Any, cost_limit: float | N
 
 
 def scores(episode_return: float, episode_cost: float, reference: Reference) -> dict[str, float | bool | None]:
-    """The derived metrics of one seed's mean return and cost; None where the reference lacks a level."""
+    """The scores of one seed, from its mean return and cost; None where a level that a score needs is unknown."""
     violation = relative = penalized = None
     recovered = reference.recovered_return(episode_return)
     if reference.allowed_cost is not None:
@@ -124,7 +124,7 @@ def per_seed_scores(evaluation: Any, cost_rate: np.ndarray | None, reference: Re
 def aggregate_scores(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | None] | None]:
     """Over seeds: interquartile mean with its 95% bootstrap interval, mean and standard deviation of every score.
 
-    None where a seed lacks the score, and in place of a spread that so few seeds do not have.
+    None in place of a score that a seed lacks, and of an interval or deviation for which there are too few seeds.
     """
     result: dict[str, dict[str, float | None] | None] = {}
     for name in SCORES:
@@ -141,18 +141,24 @@ def aggregate_scores(rows: list[dict[str, Any]]) -> dict[str, dict[str, float | 
 
 
 def _of_mean(errors: list[float | None]) -> float | None:
-    """The standard error of the mean over seeds' episodes, which are independent; None where a seed's is unknown."""
+    """The standard error of the mean over seeds, sqrt(sum e_s^2) / S, from those of the seeds; None if one is unknown.
+
+    The episodes of different seeds are independent.
+    """
     known = [error for error in errors if error is not None]
     return float(np.sqrt(np.sum(np.square(known)))) / len(known) if len(known) == len(errors) else None
 
 
 def mean_violation_beyond_error(rows: list[dict[str, Any]], reference: Reference) -> bool | None:
-    """The mark of the aggregate: that of the mean cost over seeds."""
+    """Whether the mean cost over seeds is a violation beyond the error of the demonstrations."""
     return reference.violation_beyond_error(float(np.mean([row["episode_cost"] for row in rows])))
 
 
 def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, Any], reference: Reference) -> None:
-    """Prints seeds, aggregate, expert and random policy as one table; means over episodes with standard errors."""
+    """Prints a table of the seeds, their aggregate, the expert and the random policy.
+
+    Means over episodes have their standard errors beside them.
+    """
     from rich.table import Table
 
     table = Table(title=title, title_justify="left", caption_justify="left")

@@ -1,1 +1,1 @@
-"""How fast the program is, beside the engine alone and beside other libraries."""
+"""How fast training is, compared with the physics engine alone and with other packages."""

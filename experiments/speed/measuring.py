@@ -1,10 +1,9 @@
 """One row of the benchmark: how fast physics, rollouts, training and the meta-gradient are on this machine."""
 
-import dataclasses
 import resource
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,41 +18,21 @@ from ccil_jax.acting import networks, rollout, running_statistics
 from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config
-from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.learning import constraints, policy_step
-from ccil_jax.presets import PRESETS
 from ccil_jax.training import program
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
 from envs.task_info import physics_name
+from experiments.speed.setting import Setting, make_config, noise
 from experiments.speed.turns import turn
 
-_MOST_SIMS = 1024  # of C MuJoCo, stepped for comparison
-_LONG = 1_000_000  # environment steps
+_MOST_SIMS = 1024  # simulations of C MuJoCo that are stepped for comparison, at most
 
-Work = Callable[[], int]  # does a fixed amount of work, waits for it, and returns how many units it was
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Setting:
-    """What a row measures."""
-
-    task: str
-    physics: str
-    method: str
-    num_seeds: int
-    num_envs: int
-    preset: str
-    rounds: int  # measurements of each kind, taken in turn
-    seconds: float  # least duration of one measurement
-    seed: int
-    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # to the preset: fields of `Config`
-    num_demonstration_steps: int = 10_000
-    turns: str | None = None  # a file: what is measured beside others waits until none of them compiles or measures
+Work = Callable[[], int]  # does a fixed amount of work, waits until it is done, and returns the number of units
 
 
 def measure_training(setting: Setting) -> dict[str, Any]:
-    """Whole training alone: seconds per iteration (the median), seconds to compile, and peak memory."""
+    """Measures whole training only: seconds per iteration (the median), seconds to compile, and peak memory."""
     env: Any = envs.make(setting.task, physics=setting.physics)
     config = make_config(setting)
     training, compile_seconds = training_work(config, env, setting)
@@ -71,18 +50,8 @@ def measure_training(setting: Setting) -> dict[str, Any]:
     }
 
 
-def make_config(setting: Setting) -> Config:
-    """Of the training that is measured: two iterations, which make a chunk, or a single long one."""
-    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in setting.changes.items()}
-    chosen = {"method": setting.method, "num_envs": setting.num_envs}
-    # Where a limit is prescribed, any will do: it does not matter for the speed.
-    config = Config.from_base({"cost_limit": 0.0, **PRESETS[setting.preset], **changes}, chosen)
-    num_iterations = 2 if setting.num_seeds * config.steps_per_iteration < _LONG else 1
-    return config.replace(env_steps=num_iterations * config.steps_per_iteration)
-
-
 def measure(setting: Setting) -> dict[str, Any]:
-    """Measures everything in turn, `rounds` times, and returns medians.
+    """Measures each kind of work once per round, and returns medians over the rounds.
 
     Rates are control steps of all seeds per second; a control step is `num_substeps` engine steps.
     `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does (but see
@@ -140,7 +109,7 @@ def rate_of(work: Work, seconds: float) -> float:
 
 
 def _peak_memory() -> float:
-    """`peak_memory` of a row, MiB: the most that was allocated on the accelerators, or else this process's size."""
+    """Peak memory in MiB: allocated on all accelerators, or without an accelerator the resident size of the process."""
     on_devices = [device.memory_stats() for device in jax.local_devices()]
     if all(on_devices):  # None on a CPU
         return sum(stats["peak_bytes_in_use"] for stats in on_devices if stats) / 2**20
@@ -149,9 +118,9 @@ def _peak_memory() -> float:
 
 
 def physics_work(env: Any, setting: Setting) -> Work:
-    """The engine alone, from states after a reset: no JAX, no observations, rewards or further resets.
+    """Steps the engine alone, from states after a reset: without JAX, observations, rewards and further resets.
 
-    Of many simulations only some: its rate does not grow any more, but each takes memory.
+    At most `_MOST_SIMS` simulations are stepped: more would not raise the rate, and each takes memory.
     """
     from envs.physics.native import usable_cpus
 
@@ -176,7 +145,7 @@ def physics_work(env: Any, setting: Setting) -> Work:
 
 
 def rollout_work(config: Config, env: Any, setting: Setting) -> Work:
-    """Policy and environment inside one compiled program, without learning."""
+    """Runs the policy in the environment, inside one compiled program, without learning."""
     policy = networks.make_policy(config, env.obs_dim, env.action_dim)
 
     def init(key: jax.Array) -> tuple[Any, Any]:
@@ -202,30 +171,15 @@ def rollout_work(config: Config, env: Any, setting: Setting) -> Work:
 
 
 def spread(function: Callable[..., Any], num_seeds: int) -> Callable[..., Any]:
-    """A function of one seed as one of all, [S]-leading, on as many devices as training uses."""
+    """Turns a function of one seed into one of all seeds, [S]-leading, on the same devices as training uses."""
     mesh, spec = meshes.run_mesh(num_seeds), jax.P("runs")
     return jax.jit(
         jax.shard_map(full_precision(jax.vmap(function)), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     )
 
 
-def noise(env: Any, setting: Setting) -> Demonstrations:
-    """Demonstrations of the right shapes, whose content does not matter for the time it takes to learn from them."""
-    random = np.random.default_rng(setting.seed)
-    num_steps = setting.num_demonstration_steps
-    return Demonstrations(
-        obs=random.standard_normal((num_steps, env.obs_dim)).astype(np.float32),
-        actions=random.uniform(env.action_low, env.action_high, (num_steps, env.action_dim)).astype(np.float32),
-        rewards=None,
-        costs=np.ones(num_steps, np.float32),
-        terminated=np.zeros(num_steps, bool),
-        truncated=np.arange(num_steps) % 1000 == 999,
-        episode_ends=np.arange(1000, num_steps + 1, 1000),
-    )
-
-
 def training_work(config: Config, env: Any, setting: Setting) -> tuple[Work, float]:
-    """Whole iterations, as `train` runs them, and the seconds that compiling them took."""
+    """Runs whole iterations as `train` does. The second value is the seconds that it took to compile them."""
     expert = noise(env, setting)
     resolved = build.resolve(config, env, expert)
     compiled = program.compile_program(resolved, env, expert_data(expert), setting.num_seeds)

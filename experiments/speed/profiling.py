@@ -1,4 +1,4 @@
-"""Where the time of an iteration goes: its parts, each compiled and timed by itself on the data that it has there."""
+"""Where the time of an iteration goes: each of its parts is compiled and timed separately, on data of an iteration."""
 
 import functools
 from collections.abc import Callable
@@ -18,16 +18,14 @@ from ccil_jax.learning.policy_step import PolicyStep
 from ccil_jax.types import Batch, Transition
 from envs.task_info import physics_name
 from experiments.speed.measuring import (
-    Setting,
     Work,
-    make_config,
-    noise,
     physics_work,
     rate_of,
     spread,
     training_work,
     wait,
 )
+from experiments.speed.setting import Setting, make_config, noise
 
 PHYSICS = "physics alone"
 
@@ -85,7 +83,7 @@ def pieces_of(parts: Parts) -> Pieces:
 
 
 def works(setting: Setting, env: Any) -> dict[str, Work]:
-    """What is timed, by name: each piece on the data that an untrained learner has there, for all seeds together."""
+    """The work that is timed, by name: each piece for all seeds together, on data of an untrained learner."""
     demonstrations = noise(env, setting)
     config = build.resolve(make_config(setting), env, demonstrations)
     parts = on_policy.make_parts(config, env, expert_data(demonstrations))
@@ -125,10 +123,11 @@ def works(setting: Setting, env: Any) -> dict[str, Work]:
 
 
 def profile(setting: Setting) -> dict[str, Any]:
-    """Microseconds per environment step, all seeds together, of each part, and their ratios to physics alone.
+    """Measures the microseconds per environment step of each part, and their ratios to those of physics alone.
 
-    The parts are measured in turn, `rounds` times, and the ratios taken within a round; medians. `environment` steps
-    under the random actions that `physics alone` has; all else is what the policy of an untrained learner meets.
+    Times are divided by the environment steps of all seeds together. In every round each part is measured once; ratios
+    are taken within a round, and medians over the rounds are returned. `environment` steps under random actions, as
+    `physics alone` does; all other parts work on data from the policy of an untrained learner.
     """
     env: Any = envs.make(setting.task, physics=setting.physics)
     timed = works(setting, env)

@@ -1,4 +1,4 @@
-"""Processes that prepare side by side and measure one at a time, by locks on a file."""
+"""Lets several processes compile at the same time, but only one of them measure, by locks on a file."""
 
 import contextlib
 from collections.abc import Iterator
@@ -7,7 +7,12 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def turn(file: str | None, *, alone: bool) -> Iterator[None]:
-    """Waits until this process may work: `alone`, or beside others that are not. Without a file it may at once."""
+    """Waits for the right to work, and holds it inside the `with` block.
+
+    Args:
+        file: the lock file that the processes share; None: there is nobody to wait for.
+        alone: whether no other process may work at the same time. Otherwise several may, if none of them is alone.
+    """
     if file is None:
         yield
         return
@@ -15,4 +20,4 @@ def turn(file: str | None, *, alone: bool) -> Iterator[None]:
 
     with Path(file).open("a") as opened:
         fcntl.flock(opened, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
-        yield  # closing gives the lock back, as does the end of a process
+        yield  # closing the file releases the lock, and so does the end of the process

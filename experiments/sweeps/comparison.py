@@ -1,4 +1,4 @@
-"""Finished variants side by side: rows of figures, a CSV file, a terminal table."""
+"""Finished variants compared: a row of numbers for each, a CSV file, a terminal table."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -11,17 +11,18 @@ from ccil_jax.config import Config
 from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number, show
 from experiments.runs import run_folder
 from experiments.runs.intervals import bootstrap_interval
+from experiments.runs.metrics_file import read_metrics
 from experiments.runs.summary import NO_INTERVAL
 from experiments.sweeps.variants import Variant
 
 SCORES = ("episode_return", "episode_cost", "recovered_return", "relative_cost_violation")
-_FINAL = 0.1  # share of the iterations whose mean is called final
+_FINAL = 0.1  # the final value of a multiplier is its mean over this share of the iterations, the last ones
 
 Row = dict[str, Any]
 
 
 def row(variant: Variant) -> Row:
-    """What a finished variant came to: scores with intervals over seeds, its multiplier, its speed."""
+    """The row of a finished variant: scores with intervals over seeds, its multiplier, its speed."""
     summary = run_folder.read_json(variant.plan.folder / "summary.json")
     content: Row = {"variant": variant.name, "task": variant.plan.setup.task, "method": variant.plan.config.method}
     content |= {"num_seeds": variant.plan.setup.num_seeds, "env_steps": summary["env_steps"]}
@@ -37,7 +38,7 @@ def row(variant: Variant) -> Row:
                 seed.get(f"{name}_standard_error") for seed in summary["per_seed"]
             ]
     content["violation_beyond_error"] = summary.get("violation_beyond_error")  # earlier versions do not say
-    metrics = run_folder.read_metrics(variant.plan.folder)
+    metrics = read_metrics(variant.plan.folder)
     limit = summary["expert_cost"] if summary["cost_limit"] is None else summary["cost_limit"]
     content |= multiplier_path(variant.plan.config, metrics, limit)
     rate, num_runs = summary["env_steps_per_second"], summary["runs_in_program"]
@@ -45,11 +46,16 @@ def row(variant: Variant) -> Row:
 
 
 def multiplier_path(config: Config, metrics: Mapping[str, np.ndarray], limit: float | None) -> Row:
-    """Whether the multiplier wound up; metrics are [num_iterations, num_seeds], results means over seeds.
+    """The course of the multiplier in numbers, each a mean over seeds; None for a method without a multiplier.
 
-    `final_multiplier` is its mean over the last tenth of the iterations, `windup` the share of the iterations with a
-    known cost in which the cost was already below the limit while the multiplier was still above its final value.
-    Methods without a multiplier get None, whatever they log.
+    `max_multiplier` is its largest value and `final_multiplier` its mean over the last tenth of the iterations.
+    `windup` is the share of the iterations with a known cost in which the cost was already below the limit while the
+    multiplier was still above its final value.
+
+    Args:
+        config: of the run.
+        metrics: of the run, [num_iterations, num_seeds] each.
+        limit: of the episode cost; None if there is none.
     """
     if not config.has_multiplier:
         return dict.fromkeys(("max_multiplier", "final_multiplier", "windup"))
@@ -66,7 +72,7 @@ def multiplier_path(config: Config, metrics: Mapping[str, np.ndarray], limit: fl
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """The rows as a CSV file; values of single seeds are separated by blanks."""
+    """Writes the rows as a CSV file. The values of single seeds stand in one cell, separated by blanks."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -74,7 +80,14 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], section: str = "") -> None:
-    """The rows as a terminal table with these columns (name: heading); a rule where the value of `section` changes."""
+    """Prints the rows as a table.
+
+    Args:
+        title: of the table.
+        columns: names of the values to show, with their headings.
+        rows: from `row`.
+        section: name of a value. Where it changes from one row to the next, a line separates the rows.
+    """
     from rich.table import Table
 
     table = Table(title=title, title_justify="left", caption_justify="left")
@@ -93,7 +106,7 @@ def print_rows(title: str, columns: Mapping[str, str], rows: Sequence[Row], sect
 
 
 def note_on_intervals(rows: Sequence[Row]) -> str:
-    """What to say of rows without an interval; empty where all have one."""
+    """The note that explains missing intervals; empty if all rows have intervals."""
     missing = any(row[name] is not None and row[f"{name}_low"] is None for row in rows for name in SCORES)
     return NO_INTERVAL if missing else ""
 

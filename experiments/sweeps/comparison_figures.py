@@ -1,4 +1,4 @@
-"""Variants side by side as a figure."""
+"""The figure in which finished variants are compared."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,8 +20,9 @@ _REFERENCES = {"recovered_return": 100.0, "relative_cost_violation": 0.0}  # the
 def draw_groups(path: Path, groups: Mapping[str, Sequence[Row]], label: str, title: str) -> None:
     """Writes a PNG file with one panel per group: a line for each row, named by its column `label`.
 
-    Left is the return, right the cost: interquartile mean, 95 % interval, and every seed as a dot. Where there is no
-    expert to compare with, both are shown as they are. What is unknown is left out.
+    On the left is the recovered return, on the right the relative cost violation: the interquartile mean, its 95 %
+    interval, and every seed as a dot. If there is no expert to compare with, return and cost themselves are shown.
+    Unknown values are left out.
     """
     note = note_on_intervals([row for rows in groups.values() for row in rows])
     known = all(row["recovered_return"] is not None for rows in groups.values() for row in rows)

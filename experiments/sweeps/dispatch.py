@@ -1,4 +1,4 @@
-"""What `sweep` and `ablations` share: carrying out variants in few programs, and finding them again."""
+"""What `sweep` and `ablations` share: their options, and training the variants that are not finished yet."""
 
 import argparse
 import sys
@@ -14,21 +14,24 @@ from experiments.runs.provenance import provenance
 from experiments.sweeps import backends, machine, variants
 from experiments.sweeps.variants import Job, Variant
 
-_INTERRUPTED = 130  # exit status after Ctrl-C, as of shells
+_INTERRUPTED = 130  # exit status after Ctrl-C, by the convention of shells: 128 plus the signal
 
 
 def add_options(parser: Parser) -> None:
-    """Where and how programs are carried out, and where the results go."""
+    """Adds the options that say where and how programs are carried out, and where the results go."""
     default = max(1, len(machine.usable_cpus()) // 2)
     parser.add_argument(
         "--workers",
         type=command_line.positive,
         default=default,
         metavar="N",
-        help=f"programs at a time; those of one machine share its CPUs (default: one for two CPUs, {default} here)",
+        help=f"programs at a time; those on one machine share its CPUs (default: one per two CPUs, {default} here)",
     )
     parser.add_argument(
-        "--launcher", choices=tuple(backends.BACKENDS), default="processes", help="who carries programs out"
+        "--launcher",
+        choices=tuple(backends.BACKENDS),
+        default="processes",
+        help="where the programs run (default: processes)",
     )
     for name, backend in backends.BACKENDS.items():
         if backend.settings:
@@ -49,7 +52,7 @@ def _with_settings() -> list[str]:
 
 
 def _settings(arguments: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """The settings given, by the launcher that they are of."""
+    """The settings that were given, by the name of the launcher that they belong to."""
     return {name: dict(getattr(arguments, name)) for name in _with_settings()}
 
 
@@ -65,12 +68,12 @@ def carry_out(chosen: Sequence[Variant], arguments: argparse.Namespace, record: 
 
     Args:
         chosen: all variants.
-        arguments: those of `add_options`.
+        arguments: of the command line, with those of `add_options`.
         record: name of the file in --out that keeps `choices`.
-        choices: what the study is; a folder that holds others is refused.
+        choices: what the study compares. With --resume they must be the same as in `record`.
 
     Raises:
-        UsageError: before anything has begun.
+        UsageError: something is wrong; nothing has been started.
     """
     out: Path = arguments.out
     backends.check_launcher(arguments.launcher)

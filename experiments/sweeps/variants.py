@@ -1,9 +1,9 @@
-"""Variants of a training run, and the programs that train those together which differ in traced fields alone.
+"""Variants of a training run, and the jobs that train them: variants that differ only in traced fields share a job.
 
     OUT/runs/<variant>/         a run folder like that of `train`
-    OUT/programs/<program>/     program.json, worker.log and the checkpoints of all its runs together
+    OUT/programs/<job>/         program.json, worker.log and the checkpoints of all its runs together
 
-A variant is a list of `train` options, so a program is handed to whatever process will carry it out as plain text.
+A variant is a list of options of `train`. So program.json is plain text, which any worker process can carry out.
 """
 
 import dataclasses
@@ -27,10 +27,10 @@ from experiments.runs.plans import RunPlan, static_values
 class Variant:
     """One configuration with its seeds."""
 
-    name: str  # and its folder's
-    options: tuple[str, ...]  # of `train`
+    name: str  # also of its folder
+    options: tuple[str, ...]  # of `train`, as they are typed
     plan: RunPlan
-    alone: bool = False  # wants a program of its own, as its speed is of interest
+    alone: bool = False  # whether it needs a job of its own, so that its speed can be measured
 
     @property
     def finished(self) -> bool:
@@ -47,7 +47,7 @@ class Job:
 
 
 class _OptionParser(Parser):
-    """The options of `train` as a table of fields: complaints are raised."""
+    """A parser for options that stand in a file: errors are raised, and do not end the process."""
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(" ".join(message.split()).removeprefix("argument "))
@@ -61,11 +61,19 @@ def make_variant(
     load: Callable[[Path], Demonstrations] = load_demonstrations,
     alone: bool = False,
 ) -> Variant:
-    """The variant with these `train` options. Raises `UsageError`, `ConfigError` or `DemonstrationsError`.
+    """Makes a variant.
 
-    `load` reads a file of demonstrations; a cached one is given where many variants share a file.
+    Args:
+        name: of the variant and of its folder.
+        fields: options of `train`, by name.
+        out: folder of the whole study.
+        load: reads a file of demonstrations. Give one with a cache where many variants share a file.
+        alone: whether the variant needs a job of its own.
+
+    Raises:
+        UserError: an option is wrong.
     """
-    if "demos" in fields:  # a worker may be started elsewhere
+    if "demos" in fields:  # an absolute path, because a worker may be started in another folder
         try:
             fields = {**fields, "demos": Path(fields["demos"]).resolve()}
         except (TypeError, ValueError):

@@ -1,6 +1,6 @@
-"""Carries out one program of a sweep: trains all its variants together and completes their run folders.
+"""Carries out one job of a sweep: trains all its variants together, in one program, and completes their run folders.
 
-`sweep` and `ablations` start it. A program that was interrupted goes on from its last checkpoint.
+`sweep` and `ablations` start it. A job that was interrupted goes on from its last checkpoint.
 """
 
 import argparse
@@ -20,13 +20,17 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("sweeps.worker", __doc__ or "")
     parser.add_argument("program", type=Path, metavar="PROGRAM_DIR", help="a folder under `programs` of a sweep")
-    parser.add_argument("--cpus", type=_cpus, metavar="I,J,...", help="run on these CPUs alone")
-    parser.add_argument("--until-eof", action="store_true", help="stop when standard input ends: whoever waits is gone")
+    parser.add_argument("--cpus", type=_cpus, metavar="I,J,...", help="use only these CPUs")
+    parser.add_argument(
+        "--until-eof",
+        action="store_true",
+        help="stop when standard input ends, because then the parent process has ended",
+    )
     return parser
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Trains, evaluates, writes the run folders."""
+    """Trains and evaluates the variants and completes their run folders."""
     if arguments.until_eof:
         interruption.stop_at_eof()
     if arguments.cpus and hasattr(os, "sched_setaffinity"):

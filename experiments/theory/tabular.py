@@ -1,4 +1,4 @@
-"""Cost-constrained imitation solved exactly, in NumPy and float64, on decision processes small enough for a table.
+"""Cost-constrained imitation, solved exactly in NumPy and float64, on decision processes with few states and actions.
 
 With occupancies rho(s, a) = (1 - gamma) sum_t gamma^t P(s_t = s, a_t = a), which sum to 1, and expectations under them,
 the problem of Theorem 1 is convex:
@@ -35,7 +35,7 @@ class Process:
         return float(np.sum(rho * self.cost))
 
     def flow(self) -> tuple[Array, Array]:
-        """Matrix [S, S * A] and right-hand side [S] of what makes an array an occupancy: what flows in flows out."""
+        """M [S, S * A] and b [S] of the flow constraints of an occupancy, M rho = b: what flows in flows out."""
         num_states, num_actions, _ = self.transition.shape
         out = np.repeat(np.eye(num_states), num_actions, axis=1)
         return out - self.gamma * self.transition.reshape(-1, num_states).T, (1 - self.gamma) * self.initial
@@ -43,11 +43,11 @@ class Process:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Solution:
-    """A learner's optimum."""
+    """The optimum of a learner."""
 
     rho: Array
     multiplier: float
-    value: float  # of the objective, with the multiplier's term
+    value: float  # of the objective, with the term of the multiplier
 
 
 def policy_of(rho: Array) -> Array:
@@ -87,7 +87,7 @@ def learner(process: Process, expert: Array, beta: float, multiplier: float) -> 
     """
     matrix, right = process.flow()
     num_states, num_actions = expert.shape
-    groups = np.kron(np.eye(num_states), np.ones((num_actions, num_actions)))  # the same state
+    groups = np.kron(np.eye(num_states), np.ones((num_actions, num_actions)))  # 1 where two pairs share a state
 
     def value(rho: Array) -> float:
         excess = process.episode_cost(rho) - process.episode_cost(expert)
@@ -104,7 +104,7 @@ def learner(process: Process, expert: Array, beta: float, multiplier: float) -> 
         step = np.linalg.solve(kkt, residual)[: rho.size].reshape(rho.shape)
         decrease = -float(np.sum(gradient * step))
         length = min(1.0, 0.99 / max(1e-300, float(np.max(-step / rho))))
-        # Near the minimum the values differ by rounding errors alone; there a full step is right.
+        # Near the minimum the values differ only by rounding errors and cannot be compared; there a full step is right.
         while decrease > 1e-12 and value(rho + length * step) > value(rho) - 1e-4 * length * decrease:
             length /= 2
         rho = rho + length * step
@@ -114,7 +114,7 @@ def learner(process: Process, expert: Array, beta: float, multiplier: float) -> 
 
 
 def saddle(process: Process, expert: Array, beta: float, bound: float = np.inf) -> Solution:
-    """The learner and its multiplier in [0, bound]: where the cost meets the expert's, or an end of the interval."""
+    """The learner with its multiplier in [0, bound]: the one at which J = J_E, or an end of the interval."""
 
     def excess(multiplier: float) -> float:
         rho = learner(process, expert, beta, multiplier).rho
@@ -136,7 +136,7 @@ def saddle(process: Process, expert: Array, beta: float, bound: float = np.inf) 
 
 
 def soft_optimum(process: Process, reward: Array, beta: float) -> tuple[Array, float]:
-    """The policy that maximises E[reward] + beta H, and that maximum, by soft value iteration: no convex solver."""
+    """The policy that maximises E[reward] + beta H, and the maximum, by soft value iteration, without convex solver."""
     value = np.zeros(len(process.initial))
     for _ in range(2000):
         q = reward + process.gamma * process.transition @ value
@@ -151,7 +151,7 @@ def soft_optimum(process: Process, reward: Array, beta: float) -> tuple[Array, f
 
 
 def dual_value(process: Process, expert: Array, beta: float, discriminator: Array, multiplier: float) -> float:
-    """What a fixed D and multiplier guarantee: the minimum over policies of the objective of Theorem 1."""
+    """The dual function: the minimum over policies of the objective of Theorem 1, for a fixed D and multiplier."""
     reward = -np.log(discriminator) - multiplier * process.cost
     constant = np.sum(expert * np.log1p(-discriminator)) - multiplier * process.episode_cost(expert)
     return float(constant) - soft_optimum(process, reward, beta)[1]

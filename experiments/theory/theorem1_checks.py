@@ -1,17 +1,17 @@
-"""The claims of Theorem 1, each computed exactly and set beside what is allowed."""
+"""The claims of Theorem 1, each computed exactly and compared with the largest error allowed."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from experiments.theory import tabular
-from experiments.theory.tabular import Array, Process, Solution
+from experiments.theory.tabular import Array, Solution
+from experiments.theory.theorem1_methods import NUM_ROUNDS, Run
+from experiments.theory.theorem1_problem import BETA, Problem, random_occupancies
 
-BETA = 0.1  # without entropy the learner just matches the expert, cost and all: nothing would be tested
-BOUNDS = np.geomspace(1e-2, 1e2, 41)  # L, of the multiplier
+BOUNDS = np.geomspace(1e-2, 1e2, 41)  # L: upper bounds of the multiplier
 BETAS = np.geomspace(1e-4, 1e-2, 9)
-NUM_ROUNDS = 6000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,62 +28,8 @@ class Check:
         return bool(self.measured <= self.tolerance)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Problem:
-    """A process with a cheap and a costly expert, and the learners of both."""
-
-    process: Process
-    cheap: Array
-    costly: Array
-    bound_by_cheap: Solution
-    bound_by_costly: Solution
-    random: np.random.Generator
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Run:
-    """An iterative method on the cheap expert, after each round."""
-
-    cost: Array  # [rounds] J
-    multiplier: Array  # [rounds] lambda, or of CVAG the one that its share of reward steps amounts to
-    distance: Array  # [rounds] largest difference of an occupancy from the solution's
-
-
-def make_problem(seed: int) -> Problem:
-    """Draws processes until one expert's cost binds its learner and the other's does not.
-
-    Both experts maximise a random reward and some entropy; the one avoids cost, the other seeks it.
-    """
-    random = np.random.default_rng(seed)
-    while True:
-        process = tabular.random_process(random)
-        reward = random.uniform(size=process.cost.shape)
-        cheap, costly = (
-            process.occupancy(tabular.soft_optimum(process, reward + liking * process.cost, 0.2)[0])
-            for liking in (-1.0, 4.0)
-        )
-        learners = [tabular.saddle(process, expert, BETA) for expert in (cheap, costly)]
-        slack = process.episode_cost(costly) - process.episode_cost(learners[1].rho)
-        if learners[0].multiplier > 0.05 and slack > 1e-3:
-            return Problem(
-                process=process,
-                cheap=cheap,
-                costly=costly,
-                bound_by_cheap=learners[0],
-                bound_by_costly=learners[1],
-                random=random,
-            )
-
-
-def random_occupancies(problem: Problem, number: int) -> Iterator[Array]:
-    """Occupancies of random policies."""
-    shape = problem.cheap.shape
-    for _ in range(number):
-        yield problem.process.occupancy(problem.random.dirichlet(np.ones(shape[1]), shape[0]))
-
-
 def check_discriminator(problem: Problem) -> list[Check]:
-    """Equation 2, maximised entry by entry without calculus: golden sections, for 20 random learners."""
+    """Equation 2, maximised numerically entry by entry (bounded scalar search), for 20 random learners."""
     from scipy.optimize import minimize_scalar
 
     value_error = argument_error = 0.0
@@ -109,12 +55,12 @@ def check_discriminator(problem: Problem) -> list[Check]:
 
 
 def bounded_learners(problem: Problem) -> list[Solution]:
-    """The cheap expert's learners for each bound L of the multiplier."""
+    """The learner of the cheap expert for each bound L of the multiplier."""
     return [tabular.saddle(problem.process, problem.cheap, BETA, bound) for bound in BOUNDS]
 
 
 def check_bounded_multiplier(problem: Problem, learners: Sequence[Solution]) -> list[Check]:
-    """psi* with lambda in [0, L] is 2 JS - log 4 + L [J - J_E]_+: an exact penalty from L = lambda* on."""
+    """With lambda in [0, L], psi* is 2 JS - log 4 + L [J - J_E]_+, which is an exact penalty for L >= lambda*."""
     process, solution = problem.process, problem.bound_by_cheap
     expert_cost = process.episode_cost(problem.cheap)
     worst = 0.0
@@ -140,7 +86,7 @@ def check_bounded_multiplier(problem: Problem, learners: Sequence[Solution]) -> 
 
 
 def check_minimax(problem: Problem) -> list[Check]:
-    """min max = max min: soft value iteration, which knows no convexity, gives D* and lambda* the same value."""
+    """min max = max min: the dual function at (D*, lambda*), by soft value iteration, has the value of the minimum."""
     checks = []
     for name, expert, solution in (
         ("cheap", problem.cheap, problem.bound_by_cheap),
@@ -171,7 +117,7 @@ def check_minimax(problem: Problem) -> list[Check]:
 
 
 def check_slackness(problem: Problem) -> list[Check]:
-    """lambda* (J - J_E) = 0: the multiplier is positive only where the cost meets the expert's."""
+    """Complementary slackness, lambda* (J - J_E) = 0: the multiplier is positive only if J = J_E."""
     excess = {
         name: problem.process.episode_cost(solution.rho) - problem.process.episode_cost(expert)
         for name, expert, solution in (
@@ -188,13 +134,13 @@ def check_slackness(problem: Problem) -> list[Check]:
 
 
 def distances(problem: Problem) -> Array:
-    """Of the learner from the cheap expert, largest difference of occupancy, for each of `BETAS`."""
+    """The largest difference of occupancy between learner and cheap expert, for each of `BETAS`."""
     learners = (tabular.saddle(problem.process, problem.cheap, beta) for beta in BETAS)
     return np.array([np.max(np.abs(x.rho - problem.cheap)) for x in learners])
 
 
 def check_small_entropy(found: Array) -> list[Check]:
-    """beta -> 0 recovers the expert, linearly."""
+    """As beta goes to 0, the learner goes to the expert, and the distance is proportional to beta."""
     slope = np.polyfit(np.log(BETAS), np.log(found), 1)[0]
     return [
         Check("beta -> 0 recovers the expert: distance at beta = 1e-4", float(found[0]), 1e-2),
@@ -202,57 +148,8 @@ def check_small_entropy(found: Array) -> list[Check]:
     ]
 
 
-def imitation_reward(problem: Problem, policy: Array) -> tuple[Array, Array]:
-    """The policy's occupancy, and -log D* less beta log pi: the slope of its entropy is part of the reward."""
-    rho = problem.process.occupancy(policy)
-    return rho, -np.log(tabular.best_discriminator(rho, problem.cheap)) - BETA * np.log(policy)
-
-
-def run_ccil(problem: Problem, size: float = 0.2, rate: float = 0.5) -> Run:
-    """CCIL: a natural step on reward less lambda times cost, then dual ascent on the gap."""
-    process, expert_cost = problem.process, problem.process.episode_cost(problem.cheap)
-    policy, multiplier, rows = np.full(problem.cheap.shape, 1 / problem.cheap.shape[1]), 0.0, []
-    for _ in range(NUM_ROUNDS):
-        rho, reward = imitation_reward(problem, policy)
-        cost = process.episode_cost(rho)
-        rows.append((cost, multiplier, np.max(np.abs(rho - problem.bound_by_cheap.rho))))
-        policy = tabular.natural_step(process, policy, reward - multiplier * process.cost, size)
-        multiplier = max(0.0, multiplier + rate * (cost - expert_cost))
-    costs, multipliers, away = np.array(rows).T
-    return Run(cost=costs, multiplier=multipliers, distance=away)
-
-
-def run_cvag(problem: Problem, size: float = 0.01) -> tuple[Run, Solution]:
-    """CVAG: a step on the reward while J is at most J_E, else on less cost; both with entropy, as printed.
-
-    The second value is what it should settle at. With a share a of reward steps the mean step is a (reward) - (1 - a)
-    (cost) + beta (entropy), so lambda = (1 - a) / a, and the entropy weighs beta / a.
-    """
-    process, expert_cost = problem.process, problem.process.episode_cost(problem.cheap)
-    policy, rows = np.full(problem.cheap.shape, 1 / problem.cheap.shape[1]), []
-    for _ in range(NUM_ROUNDS):
-        rho, reward = imitation_reward(problem, policy)
-        cost = process.episode_cost(rho)
-        within = cost <= expert_cost
-        rows.append((cost, within, rho))
-        policy = tabular.natural_step(
-            process, policy, reward if within else -process.cost - BETA * np.log(policy), size
-        )
-    rewarded = np.array([row[1] for row in rows], float)
-    share = np.cumsum(rewarded[NUM_ROUNDS // 2 :]) / np.arange(1, NUM_ROUNDS - NUM_ROUNDS // 2 + 1)
-    settled = tabular.saddle(process, problem.cheap, BETA / share[-1])
-    window = 200
-    recent = np.convolve(rewarded, np.ones(window) / window, mode="valid")
-    recent = np.concatenate([np.full(window - 1, np.nan), recent])
-    with np.errstate(divide="ignore"):
-        multiplier = (1 - recent) / recent
-    multiplier[-1] = (1 - share[-1]) / share[-1]
-    away = np.array([np.max(np.abs(row[2] - settled.rho)) for row in rows])
-    return Run(cost=np.array([row[0] for row in rows]), multiplier=multiplier, distance=away), settled
-
-
 def check_methods(problem: Problem, ccil: Run, cvag: Run, settled: Solution) -> list[Check]:
-    """CCIL converges to the saddle point, CVAG slides along J = J_E."""
+    """CCIL converges to the saddle point; CVAG stays close to J = J_E, on alternating sides of it."""
     expert_cost, half = problem.process.episode_cost(problem.cheap), NUM_ROUNDS // 2
     error = abs(ccil.multiplier[-1] - problem.bound_by_cheap.multiplier)
     sliding = float(np.mean(cvag.cost[half:])) - expert_cost

@@ -1,4 +1,4 @@
-"""The figure of `theorem1`: six panels."""
+"""The figure of the launcher `theorem1`, with six panels."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +12,9 @@ from matplotlib.figure import Figure
 from experiments.runs import figures
 from experiments.theory import tabular
 from experiments.theory.tabular import Array, Solution
-from experiments.theory.theorem1_checks import BETA, BETAS, BOUNDS, NUM_ROUNDS, Problem, Run
+from experiments.theory.theorem1_checks import BETAS, BOUNDS
+from experiments.theory.theorem1_methods import NUM_ROUNDS, Run
+from experiments.theory.theorem1_problem import BETA, Problem
 
 BLUE, RED, GREEN = figures.COLORS[:3]
 DARK: Any = {"color": "#22262b", "linewidth": 1.2, "linestyle": (0, (5, 3))}

@@ -1,6 +1,6 @@
-"""Other packages' trainers, each in an environment of its own, timed beside ours.
+"""Trainers of other packages, each in a virtual environment of its own, compared with ours.
 
-The scripts of this folder run there and import nothing of ours.
+The scripts of this folder run in those environments and import nothing of ours.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ _TIME_LIMIT = 600.0  # seconds for one way of running a peer
 
 @dataclasses.dataclass(frozen=True)
 class Peer:
-    """A package's trainer, the ways to run it, and the row of ours that does the same work."""
+    """The trainer of a package, the ways to run it, and the task and method of ours that do the same work."""
 
     title: str
     script: str
@@ -73,9 +73,17 @@ def find_pythons(folder: Path) -> dict[str, Path]:
 
 
 def compare(pythons: Mapping[str, Path], measure: Callable[[Peer, int], dict[str, Any]]) -> list[dict[str, Any]]:
-    """Times each peer in every way, before and after ours with 1 and 8 seeds (`measure`); medians.
+    """Measures the speed of each peer in every way, and of ours with 1 and 8 seeds.
 
-    Raises `UsageError` where a peer fails in every way.
+    Each peer is timed before ours and once more after it, so that a change of the machine's speed shows; the median of
+    both counts.
+
+    Args:
+        pythons: the interpreter of each peer's environment.
+        measure: measures ours for a peer and a number of seeds.
+
+    Raises:
+        UsageError: a peer fails in every way.
     """
     rows = []
     for name, peer in PEERS.items():
@@ -108,7 +116,7 @@ def compare(pythons: Mapping[str, Path], measure: Callable[[Peer, int], dict[str
 
 
 def _time(peer: Peer, python: Path, arguments: tuple[str, ...]) -> dict[str, Any]:
-    """What the script prints; a rate of 0 and an `error` where it fails or takes too long."""
+    """What the script prints. If it fails or takes too long, the rate is 0 and `error` says why."""
     command = [str(python.absolute()), str(_FOLDER / peer.script), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_TIME_LIMIT)

@@ -1,6 +1,6 @@
 """Steps per second of GAIL in `imitation` on HalfCheetah. Runs in that package's own environment; prints JSON.
 
-PPO of Stable-Baselines3 collects batches of 2000 steps; everything not given here is the packages' default.
+PPO of Stable-Baselines3 collects batches of 2000 steps; all other settings are the defaults of the packages.
 
     python imitation_gail.py DEMONSTRATIONS SIMULATIONS dummy|subproc THREADS SECONDS
 """
@@ -39,7 +39,7 @@ def demonstrations(path: str) -> Any:
 
 
 def main(path: str, num_envs: int, kind: str, num_threads: int, seconds: float) -> None:
-    """Trains until the time is up; the first round, in which things are set up, does not count."""
+    """Trains until the time is up. The first round is not counted, because it includes the setup."""
     torch.set_num_threads(num_threads)
     env = make_vec_env(
         "HalfCheetah-v4",

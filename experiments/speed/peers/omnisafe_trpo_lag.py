@@ -1,6 +1,6 @@
 """Steps per second of TRPO-Lagrangian in OmniSafe on PointGoal1. Runs in that package's own environment; prints JSON.
 
-Epochs of 2000 steps; everything not given here is the package's default.
+Epochs have 2000 steps; all other settings are the defaults of the package.
 
     python omnisafe_trpo_lag.py SIMULATIONS THREADS EPOCHS
 """
@@ -19,7 +19,7 @@ BATCH_SIZE = 2000
 
 
 def main(num_envs: int, num_threads: int, num_epochs: int) -> None:
-    """Trains some epochs; the first, in which things are set up, does not count."""
+    """Trains some epochs. The first one is not counted, because it includes the setup."""
     with tempfile.TemporaryDirectory() as folder:
         config = {
             "train_cfgs": {
