@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -279,11 +280,21 @@ def gae_by_loop(
 
 def same_bits(a: PyTree, b: PyTree) -> bool:
     """Whether two pytrees have the same structure and the same bits in every leaf."""
-
-    def data(x: Any) -> np.ndarray:
-        return np.asarray(as_numbers(x) if isinstance(x, jax.Array) else x)
-
-    if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
+    try:
+        assert_same_bits(a, b)
+    except AssertionError:
         return False
-    leaves = [(data(x), data(y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)]
-    return all(x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes() for x, y in leaves)
+    return True
+
+
+def assert_same_bits(a: PyTree, b: PyTree) -> None:
+    """Fails, and names the first leaf that differs, unless two pytrees have the same structure and the same bits.
+
+    Stronger than `chex.assert_trees_all_equal`: 0 and -0 differ, and so do dtypes.
+    """
+    chex.assert_trees_all_equal_comparator(_same_leaf, lambda x, y: f"{x!r} and {y!r}", a, b)
+
+
+def _same_leaf(one: Any, other: Any) -> bool:
+    x, y = (np.asarray(as_numbers(leaf) if isinstance(leaf, jax.Array) else leaf) for leaf in (one, other))
+    return x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()

@@ -13,7 +13,7 @@ from ccil_jax.agents import behavior_cloning, build
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training import runner
-from tests.probe_envs import Walk, numpy_policy, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, assert_same_bits, numpy_policy, quick_compilation, walk_config, walk_demonstrations
 
 SLOPE, STD = np.array([0.5, -0.3]), 0.2
 
@@ -73,7 +73,7 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
         seen.append(state.params)
     best = int(np.argmin(losses))
     assert best < 50 and losses[-1] > losses[best] + 0.2
-    assert same_bits(state.actor.policy_params, seen[best])
+    assert_same_bits(state.actor.policy_params, seen[best])
     assert float(state.held_out_loss) == losses[best]
 
 
@@ -87,7 +87,7 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
     whole = train()
     train(tmp_path, stop_after=10)
     resumed = train(tmp_path, resume=True)
-    assert same_bits(resumed.state, whole.state)
-    assert all(same_bits(resumed.metrics[name], rows) for name, rows in whole.metrics.items())
+    assert_same_bits(resumed.state, whole.state)
+    assert_same_bits({name: resumed.metrics[name] for name in whole.metrics}, whole.metrics)
     loaded = runner.load(walk_config(method="bc", bc_epochs=20), Walk(), tmp_path, 2)
-    assert same_bits(loaded.actor, whole.actor)
+    assert_same_bits(loaded.actor, whole.actor)

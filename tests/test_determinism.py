@@ -17,7 +17,7 @@ from ccil_jax.methods import METHODS
 from ccil_jax.training.checkpointing import Checkpointer
 from ccil_jax.training.manifests import Identity
 from ccil_jax.training.program import compile_program
-from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, assert_same_bits, quick_compilation, walk_config, walk_demonstrations
 
 IN_A_PROCESS = """
 import hashlib, json, jax, numpy
@@ -99,4 +99,4 @@ def test_a_run_stopped_after_any_iteration_goes_on_as_if_it_had_not_been(method:
         with Checkpointer(tmp_path / str(stop), Identity(configs=(config,))) as checkpoints:
             checkpoints.save(stop, {"state": run(program.init(keys), stop)})
             state = checkpoints.restore(stop, {"state": program.state})["state"]
-        assert same_bits(run(state, NUM_ITERATIONS - stop), whole), stop
+        assert_same_bits(run(state, NUM_ITERATIONS - stop), whole)

@@ -12,7 +12,7 @@ from ccil_jax.acting import evaluation, networks, rollout, running_statistics
 from ccil_jax.acting.evaluation import Evaluation
 from ccil_jax.acting.rollout import Actor
 from envs.base import State
-from tests.probe_envs import Walk, same_bits, walk_config
+from tests.probe_envs import Walk, assert_same_bits, walk_config
 
 CONFIG = walk_config(method="trpo")
 
@@ -58,7 +58,7 @@ def test_the_random_policys_episodes_do_not_depend_on_how_they_are_shared(monkey
     assert np.unique(many.episode_return).size == 7
     np.testing.assert_allclose(few.episode_return, many.episode_return[:, :4], rtol=1e-5)
     monkeypatch.setattr(evaluation, "usable_devices", lambda: [None] * 3)
-    assert same_bits(evaluation.random_policy(Walk(), num_episodes=7, seed=5), many)
+    assert_same_bits(evaluation.random_policy(Walk(), num_episodes=7, seed=5), many)
 
 
 @dataclasses.dataclass(frozen=True)

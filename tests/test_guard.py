@@ -18,7 +18,7 @@ from ccil_jax.agents.on_policy import Agent
 from ccil_jax.training import guard
 from ccil_jax.training.guard import GuardedState
 from envs.jax_tools import is_key
-from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, assert_same_bits, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 LIMIT = 3  # iterations in a row
 NUM_SEEDS = 3
@@ -117,11 +117,11 @@ def test_a_faulty_iteration_is_taken_back(stepper: Stepper, name: str, value: fl
     state, metrics = stepper.step(before, faults(**{name: value}))
     assert state.skipped.tolist() == metrics["skipped_updates"].tolist() == [0, 1, 0]
     assert state.skipped_in_a_row.tolist() == [0, 1, 0]
-    assert same_bits(without_keys(of(state.agent, VICTIM)), without_keys(of(before.agent, VICTIM)))
+    assert_same_bits(without_keys(of(state.agent, VICTIM)), without_keys(of(before.agent, VICTIM)))
     assert not same_bits(of(state.agent.key, VICTIM), of(before.agent.key, VICTIM))
     for seed in (0, 2):
-        assert same_bits(of(state, seed), of(healthy, seed))
-        assert same_bits(of(metrics, seed), of(healthy_metrics, seed))
+        assert_same_bits(of(state, seed), of(healthy, seed))
+        assert_same_bits(of(metrics, seed), of(healthy_metrics, seed))
     recovered, _ = stepper.step(state, faults())
     assert recovered.skipped.tolist() == [0, 1, 0]
     assert recovered.skipped_in_a_row.tolist() == [0, 0, 0]
@@ -137,14 +137,14 @@ def test_a_seed_that_cannot_recover_stops_where_its_fault_can_be_replayed(steppe
         states.append(state)
     assert [int(s.skipped[VICTIM]) for s in states] == [1, 2, 3, 3, 3]
     assert guard.stopped(state, LIMIT).tolist() == [False, True, False]
-    assert same_bits(of(states[LIMIT - 1], VICTIM), of(state, VICTIM))
+    assert_same_bits(of(states[LIMIT - 1], VICTIM), of(state, VICTIM))
     # The key is the one that the last faulty iteration began with.
-    assert same_bits(of(states[LIMIT - 1].agent.key, VICTIM), of(states[LIMIT - 2].agent.key, VICTIM))
+    assert_same_bits(of(states[LIMIT - 1].agent.key, VICTIM), of(states[LIMIT - 2].agent.key, VICTIM))
     for seed in (0, 2):
-        assert same_bits(of(state, seed), of(healthy, seed))
+        assert_same_bits(of(state, seed), of(healthy, seed))
     # Stopped for good, also where the fault is gone.
     later, _ = stepper.step(state, faults())
-    assert same_bits(of(later, VICTIM), of(state, VICTIM))
+    assert_same_bits(of(later, VICTIM), of(state, VICTIM))
 
 
 def test_an_engines_infinities_are_its_own() -> None:

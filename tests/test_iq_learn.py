@@ -15,7 +15,7 @@ from ccil_jax.agents.iq_learn import Minibatch
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training import runner
-from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, assert_same_bits, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 
 def iq_config(**changes: Any) -> Config:
@@ -110,10 +110,10 @@ def whole() -> runner.Result:
 def test_a_stopped_and_resumed_run_is_the_unbroken_run(whole: runner.Result, tmp_path: Path) -> None:
     train(tmp_path, stop_after=10)
     resumed = train(tmp_path, resume=True)
-    assert same_bits(resumed.state, whole.state)
-    assert all(same_bits(resumed.metrics[name], rows) for name, rows in whole.metrics.items())
+    assert_same_bits(resumed.state, whole.state)
+    assert_same_bits({name: resumed.metrics[name] for name in whole.metrics}, whole.metrics)
     loaded = runner.load(iq_config(env_steps=20 * 32), Walk(), tmp_path, 2)
-    assert same_bits(loaded.actor, whole.actor)
+    assert_same_bits(loaded.actor, whole.actor)
 
 
 def test_it_learns_from_every_step(whole: runner.Result) -> None:

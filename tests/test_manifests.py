@@ -24,7 +24,7 @@ from ccil_jax.errors import CheckpointError, LockedError
 from ccil_jax.training import checkpointing, filesystem, manifests
 from ccil_jax.training.checkpointing import Checkpointer
 from ccil_jax.training.manifests import Identity
-from tests.probe_envs import same_bits
+from tests.probe_envs import assert_same_bits
 
 CONFIG = Config(method="lgail", cost_limit=1.0)
 IDENTITY = Identity(
@@ -70,7 +70,7 @@ def test_what_is_saved_comes_back(folder: Path) -> None:
     assert sorted(path.name for path in folder.iterdir()) == ["2", "3"]
     with Checkpointer(folder, IDENTITY) as checkpoints:
         assert checkpoints.latest_step() == 3
-        assert same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
+        assert_same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
     manifest = json.loads((folder / "3" / manifests.NAME).read_text())
     assert manifest["arrays"]["params.kernel"]["shape"] == [2, 250]
     assert manifest["arrays"]["key"]["dtype"] == "key<fry>"
@@ -120,7 +120,7 @@ def test_the_newest_good_step_is_used(
     with Checkpointer(folder, IDENTITY) as checkpoints:
         step = checkpoints.latest_step()
         assert step == 2
-        assert same_bits(checkpoints.restore(2, shapes(state(0))), state(2))
+        assert_same_bits(checkpoints.restore(2, shapes(state(0))), state(2))
         checkpoints.save(3, state(3))
         assert checkpoints.latest_step() == 3
 
@@ -228,7 +228,7 @@ def test_a_step_that_is_there_is_never_saved_over(folder: Path) -> None:
         with pytest.raises(CheckpointError, match="1: not saved, as"):
             checkpoints.save(1, state(1))
         assert checkpoints.latest_step() == 3
-        assert same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
+        assert_same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
         with pytest.raises(CheckpointError, match=r"holds checkpoints already \(steps 2, 3\)"):
             checkpoints.check_empty()
 
@@ -241,7 +241,7 @@ def test_what_is_replaced_is_set_aside_whole(folder: Path) -> None:
         checkpoints.replace(2, state(7))
         assert sorted(path.name for path in folder.iterdir()) == ["2", "2.replaced", "3.replaced"]
         assert checkpoints.latest_step() == 2
-        assert same_bits(checkpoints.restore(2, shapes(state(0))), state(7))
+        assert_same_bits(checkpoints.restore(2, shapes(state(0))), state(7))
     assert (folder / "3.replaced" / manifests.NAME).read_bytes() == before
     manifests.read(folder / "2.replaced")
     with Checkpointer(folder, IDENTITY) as checkpoints:

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -86,7 +87,7 @@ def test_step_has_no_hidden_state(cheetah: NativePhysics) -> None:
     data = step(jax.vmap(cheetah.init)(qpos, qvel), ctrl)
     first = step(data, ctrl)
     step(jax.tree.map(lambda x: x[::-1], data), -ctrl)
-    jax.tree.map(np.testing.assert_array_equal, first, step(data, ctrl))
+    chex.assert_trees_all_equal(first, step(data, ctrl))
 
 
 def test_vmap_over_seeds_and_simulations_equals_single(cheetah: NativePhysics) -> None:
@@ -99,14 +100,14 @@ def test_vmap_over_seeds_and_simulations_equals_single(cheetah: NativePhysics) -
     nested = jax.jit(jax.vmap(jax.vmap(steps)))(*(x.reshape(2, 3, -1) for x in (qpos, qvel, ctrl)))
     single = [jax.jit(steps)(qpos[i], qvel[i], ctrl[i]) for i in range(6)]
     stacked = jax.tree.map(lambda *x: np.stack(x).reshape(2, 3, *x[0].shape), *single)
-    jax.tree.map(np.testing.assert_array_equal, nested, stacked)
+    chex.assert_trees_all_equal(nested, stacked)
 
 
 def test_results_do_not_depend_on_the_number_of_threads(cheetah: NativePhysics) -> None:
     serial = make_physics("native", load_model("half_cheetah.xml"), num_substeps=5, track=["qpos"], num_threads=1)
     qpos, qvel, ctrl = starts(16, 9)
     results = [jax.vmap(p.step)(jax.vmap(p.init)(qpos, qvel), ctrl) for p in (cheetah, serial)]
-    jax.tree.map(np.testing.assert_array_equal, *results)
+    chex.assert_trees_all_equal(*results)
 
 
 def test_step_with_a_constant_control_under_vmap(cheetah: NativePhysics) -> None:
@@ -115,7 +116,7 @@ def test_step_with_a_constant_control_under_vmap(cheetah: NativePhysics) -> None
     data = jax.vmap(cheetah.init)(qpos, qvel)
     shared = jax.vmap(cheetah.step, in_axes=(0, None))(data, ctrl[0])
     tiled = jax.vmap(cheetah.step)(data, np.tile(ctrl[0], (4, 1)))
-    jax.tree.map(np.testing.assert_array_equal, shared, tiled)
+    chex.assert_trees_all_equal(shared, tiled)
 
 
 def test_change_keeps_its_precision_far_from_the_origin(cheetah: NativePhysics) -> None:
@@ -149,7 +150,7 @@ def test_both_kinds_of_call_agree(cheetah: NativePhysics, monkeypatch: pytest.Mo
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert "pure_callback" in str(jax.make_jaxpr(jax.vmap(step))(qpos, qvel, ctrl))
     by_value = jax.jit(jax.vmap(jax.vmap(lambda *x: step(*x))))(*arguments)
-    jax.tree.map(np.testing.assert_array_equal, by_xla, by_value)
+    chex.assert_trees_all_equal(by_xla, by_value)
 
 
 def test_more_sizes_of_batches_than_an_engine_keeps(cheetah: NativePhysics) -> None:
@@ -178,7 +179,7 @@ def test_programs_on_several_threads_share_an_engine(cheetah: NativePhysics) -> 
     expected = [walk(data, scale) for scale in scales]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda scale: jax.block_until_ready(walk(data, scale)), scales))
-    jax.tree.map(np.testing.assert_array_equal, found, expected)
+    chex.assert_trees_all_equal(found, expected)
 
 
 CACHED = """
@@ -278,7 +279,7 @@ def test_mjx_equals_c_on_a_pendulum_and_scans() -> None:
         results.append(
             {"qpos": data.qpos, "qvel": data.qvel, **data.fields, **{"d" + k: v for k, v in data.change.items()}}
         )
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), *results)
+    chex.assert_trees_all_close(*results, rtol=1e-4, atol=1e-5)
 
 
 def test_mjx_step_is_differentiable() -> None:

@@ -15,7 +15,7 @@ from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.errors import CheckpointError, ConfigError
 from ccil_jax.training import runner
 from ccil_jax.training.runner import Result
-from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import Walk, assert_same_bits, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 
 def train(
@@ -42,12 +42,12 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
     # Every call builds its program anew, as a new process would.
     resumed = train(tmp_path, resume=True)
     assert resumed.env_steps == whole.env_steps == 20 * 64
-    assert same_bits(resumed.state, whole.state)
+    assert_same_bits(resumed.state, whole.state)
     assert set(resumed.metrics) == set(whole.metrics)
     for name, rows in whole.metrics.items():
         assert rows.shape == (20, 2)
-        assert same_bits(resumed.metrics[name], rows), name
-        assert same_bits(resumed.metrics[name][:10], half.metrics[name]), name
+        assert_same_bits(resumed.metrics[name], rows)
+        assert_same_bits(resumed.metrics[name][:10], half.metrics[name])
     np.testing.assert_array_equal(whole.metrics["env_steps"][:, 0], 64 * np.arange(1, 21))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(whole.metrics))
 
@@ -59,7 +59,7 @@ def test_a_folder_with_checkpoints_is_not_trained_into(tmp_path: Path) -> None:
         train(tmp_path)
     assert {path: path.read_bytes() for path in before} == before
     again = train(tmp_path, resume=True, stop_after=0)  # reads, and takes no step
-    assert same_bits(again.state, half.state)
+    assert_same_bits(again.state, half.state)
 
 
 def test_no_step_is_no_step(tmp_path: Path) -> None:
@@ -189,4 +189,4 @@ def test_a_longer_run_ends_where_it_should(tmp_path: Path) -> None:
     assert longer.env_steps == 10 * 64
     np.testing.assert_array_equal(longer.metrics["env_steps"][:, 0], 64 * np.arange(1, 11))
     for name, rows in short.metrics.items():
-        assert same_bits(longer.metrics[name][:7], rows), name
+        assert_same_bits(longer.metrics[name][:7], rows)

@@ -26,7 +26,14 @@ from ccil_jax.training.program import compile_program
 from ccil_jax.training.runner import Result
 from envs.base import Environment
 from experiments.cli import xla
-from tests.probe_envs import Counter, Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
+from tests.probe_envs import (
+    Counter,
+    Walk,
+    assert_same_bits,
+    quick_compilation,
+    walk_config,
+    walk_demonstrations,
+)
 
 NUM_SEEDS = 2
 CHOICES = ((1.0, 0.02, 0.5), (2.0, 0.0, 0.25), (0.5, 0.1, 0.0))  # cost limit, step size and start of the multiplier
@@ -68,7 +75,7 @@ def test_every_run_has_its_own_numbers(results: list[Result]) -> None:
 
 def test_the_order_of_the_configurations_does_not_matter(results: list[Result]) -> None:
     for result, same in zip(results, reversed(train(*reversed(CHOICES))), strict=True):
-        assert same_bits((result.state, result.metrics), (same.state, same.metrics))
+        assert_same_bits((result.state, result.metrics), (same.state, same.metrics))
 
 
 def test_a_run_begins_as_it_would_alone(results: list[Result]) -> None:
@@ -82,10 +89,10 @@ def test_stopped_and_resumed_together(results: list[Result], tmp_path: Path) -> 
     train(*CHOICES, checkpoint_dir=tmp_path / "together", stop_after=10)
     resumed = train(*CHOICES, checkpoint_dir=tmp_path / "together", resume=True)
     for i, (result, same) in enumerate(zip(results, resumed, strict=True)):
-        assert same_bits((result.state, result.metrics), (same.state, same.metrics))
+        assert_same_bits((result.state, result.metrics), (same.state, same.metrics))
         runner.save(result, tmp_path / str(i))
         loaded = runner.load(result.config, Walk(), tmp_path / str(i), NUM_SEEDS)
-        assert same_bits(loaded.actor, result.actor)
+        assert_same_bits(loaded.actor, result.actor)
 
 
 @pytest.mark.parametrize(

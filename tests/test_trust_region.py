@@ -15,7 +15,7 @@ from ccil_jax.acting import distributions
 from ccil_jax.learning import constraints, policy_step, trust_region
 from ccil_jax.learning.trust_region import Directions
 from ccil_jax.types import Metrics, PyTree
-from tests.probe_envs import PolicyProblem, numpy_log_prob, numpy_policy, policy_problem, same_bits
+from tests.probe_envs import PolicyProblem, assert_same_bits, numpy_log_prob, numpy_policy, policy_problem, same_bits
 
 
 def matrix_product(matrix: Any) -> Callable[[jax.Array], jax.Array]:
@@ -273,7 +273,7 @@ def test_a_step_that_nothing_accepts_leaves_the_parameters_bit_for_bit(
     outcome: tuple[float, float], reason: str
 ) -> None:
     new, fraction, metrics = step(within(0.0, outcome, outcome), DELICATE)
-    assert same_bits(new, DELICATE)
+    assert_same_bits(new, DELICATE)
     assert fraction == 0
     assert metrics == no_step(reason)
 
@@ -298,7 +298,7 @@ def test_an_infinite_candidate_is_rejected() -> None:
     new, fraction, _ = trust_region.step(
         start, along, jnp.ones(1), always, max_kl=0.5, kl_tolerance=1.5, num_halvings=3
     )
-    assert same_bits(new, START)
+    assert_same_bits(new, START)
     assert fraction == 0
 
 
@@ -308,7 +308,7 @@ def test_a_non_finite_sample_leaves_the_policy_bit_for_bit(field: str, value: fl
     problem = policy_problem(2)
     bad = getattr(problem.training, field).at[3].set(value)
     new, taken, metrics = _improve_batch(problem.training.replace(**{field: bad}))
-    assert same_bits(new, problem.params)
+    assert_same_bits(new, problem.params)
     assert taken.fraction == 0
     assert {name: metrics[name] for name in no_step("kl")} == no_step("rejected_not_finite")
 
@@ -362,7 +362,7 @@ def test_a_zero_gradient_gives_a_zero_step() -> None:
     new, fraction, metrics = trust_region.step(
         start, nothing, jnp.ones(1), always, max_kl=0.5, kl_tolerance=1.5, num_halvings=3
     )
-    assert same_bits(new, START)
+    assert_same_bits(new, START)
     assert fraction == 0
     assert metrics == no_step("no_direction")
 
