@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.methods import _methods
 from experiments import ablations, benchmark, convert, evaluate, expert, report, sweep, train
 from experiments.cli import command_line
 from experiments.cli.names import safe_name
@@ -91,6 +92,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         assert train.main(["--env", TASK, "--method", "ccil", "--demos", "expert.npz", "--out", "run", *TINY]) == 0
         yield folder
     sys.modules.pop("my_task", None)
+    _methods.pop("my_task:LINEAR", None)
 
 
 def refused(capsys: pytest.CaptureFixture[str], launcher: Any, *arguments: str) -> str:
