@@ -45,43 +45,45 @@ def usual_rules(function: Callable[Arguments, Tree]) -> Callable[Arguments, Tree
 
 
 def compute_where(needed: jax.Array, compute: Callable[..., Tree], otherwise: Tree, *args: PyTree) -> Tree:
-    """`compute(*args)` where `needed` [] bool, else `otherwise`: for what is dear and rarely needed, as a reset.
+    """`compute(*args)` where `needed` [] bool, else `otherwise`: for what is slow and rarely needed, such as a reset.
 
-    Vmapped, it computes only when some simulation of the batch needs it, while `lax.cond` would at every step.
+    Under vmap `jax.lax.cond` becomes a select: it computes both sides, at every step. This is a loop of at most one
+    turn instead, which is skipped when no simulation of the batch needs it.
     """
 
     def turn(carry: tuple[jax.Array, Tree]) -> tuple[jax.Array, Tree]:
-        # The barrier ties the arguments to this turn: XLA moves out of a loop what depends on nothing in it. Keys pass
-        # it as plain numbers: JAX's check of key reuse does not know that the loop turns once.
-        needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(numbers, args)))
-        return jnp.zeros_like(needed), compute(*jax.tree.map(as_before, args, bound))
+        # XLA moves out of a loop what does not depend on its carry, and would compute at every step after all. The
+        # barrier makes the arguments depend on it. Keys pass the barrier as plain numbers, because JAX's check of key
+        # reuse does not know that the loop has one turn.
+        needed, bound = jax.lax.optimization_barrier((carry[0], jax.tree.map(as_numbers, args)))
+        return jnp.zeros_like(needed), compute(*jax.tree.map(as_key_like, args, bound))
 
     return jax.lax.while_loop(lambda carry: carry[0], turn, (needed, otherwise))[1]
 
 
 def scan(turn: Callable[[Carry, Inputs], tuple[Carry, Outputs]], carry: Carry, inputs: Inputs) -> tuple[Carry, Outputs]:
-    """`jax.lax.scan`, for inputs among which there are random keys.
+    """`jax.lax.scan`, for inputs that contain random keys.
 
-    Vmapped, a scan moves the axis that it goes along to the front, and JAX's check of key reuse takes a key whose axes
-    were moved for a used one. So keys are handed to the loop as plain numbers, and are keys again in each turn.
+    Under vmap a scan moves its axis to the front, and JAX's check of key reuse counts moving an axis as a use of the
+    keys. So the loop gets the numbers behind the keys, and each turn makes keys of them again.
     """
 
     def plain_turn(carry: Carry, plain: PyTree) -> tuple[Carry, Outputs]:
-        return turn(carry, jax.tree.map(as_before, inputs, plain))
+        return turn(carry, jax.tree.map(as_key_like, inputs, plain))
 
-    return jax.lax.scan(plain_turn, carry, jax.tree.map(numbers, inputs))
+    return jax.lax.scan(plain_turn, carry, jax.tree.map(as_numbers, inputs))
 
 
-def numbers(leaf: jax.Array) -> jax.Array:
-    """The leaf itself, or the numbers behind a random key."""
+def as_numbers(leaf: jax.Array) -> jax.Array:
+    """The numbers behind a random key; any other array as it is."""
     return jax.random.key_data(leaf) if is_key(leaf) else leaf
 
 
-def as_before(leaf: jax.Array, plain: jax.Array) -> jax.Array:
-    """What `numbers` made of a leaf like `leaf`, as it was: a random key where `leaf` is one."""
+def as_key_like(leaf: jax.Array, plain: jax.Array) -> jax.Array:
+    """The inverse of `as_numbers`: a random key of these numbers where `leaf` is a key, else `plain` as it is."""
     return jax.random.wrap_key_data(plain, impl=jax.random.key_impl(leaf)) if is_key(leaf) else plain
 
 
 def is_key(leaf: Any) -> bool:
-    """Whether these are random keys, not numbers."""
+    """Whether an array holds random keys (JAX's typed keys), not numbers."""
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)

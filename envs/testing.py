@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import State
-from envs.jax_tools import numbers
+from envs.jax_tools import as_numbers
 
 
 def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:
@@ -68,4 +68,4 @@ def check_environment(env: Any, num_envs: int = 8, num_steps: int = 20) -> None:
 
 
 def _assert_equal(a: jax.Array, b: jax.Array) -> None:
-    np.testing.assert_array_equal(numbers(a), numbers(b))
+    np.testing.assert_array_equal(as_numbers(a), as_numbers(b))

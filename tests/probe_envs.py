@@ -18,7 +18,7 @@ from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.types import Batch, PyTree
 from envs.base import State, first_state, next_state
-from envs.jax_tools import numbers
+from envs.jax_tools import as_numbers
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -281,7 +281,7 @@ def same_bits(a: PyTree, b: PyTree) -> bool:
     """Whether two pytrees have the same structure and the same bits in every leaf."""
 
     def data(x: Any) -> np.ndarray:
-        return np.asarray(numbers(x) if isinstance(x, jax.Array) else x)
+        return np.asarray(as_numbers(x) if isinstance(x, jax.Array) else x)
 
     if jax.tree.structure(a) != jax.tree.structure(b):  # type: ignore[operator]
         return False

@@ -22,14 +22,14 @@ from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, wa
 IN_A_PROCESS = """
 import hashlib, json, jax, numpy
 from ccil_jax.training import runner
-from envs.jax_tools import numbers
+from envs.jax_tools import as_numbers
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
 with quick_compilation():
     result = runner.train(walk_config(method="gail"), Walk(), walk_demonstrations(), num_seeds=2)
 digest = hashlib.sha256()
 for leaf in jax.tree.leaves((result.state, result.metrics)):
-    digest.update(numpy.asarray(numbers(leaf) if isinstance(leaf, jax.Array) else leaf).tobytes())
+    digest.update(numpy.asarray(as_numbers(leaf) if isinstance(leaf, jax.Array) else leaf).tobytes())
 print(json.dumps({"digest": digest.hexdigest(), "devices": len(jax.devices())}))
 """
 

@@ -31,6 +31,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     namespace: dict[str, Any] = {"__name__": "extending"}
     kept = {name: dict(table) for name, table in (("tasks", registry._tasks), ("methods", _methods))}
+    kept_formats = list(formats.FORMATS)
     with pytest.MonkeyPatch.context() as patched, quick_compilation():
         patched.chdir(tmp_path_factory.mktemp("page"))
         for block in blocks:
@@ -40,7 +41,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
     registry._tasks.update(kept["tasks"])
     _methods.clear()
     _methods.update(kept["methods"])
-    formats._formats.pop("csv")
+    formats.FORMATS[:] = kept_formats
 
 
 def test_the_tasks_keep_their_promises(names: dict[str, Any]) -> None:

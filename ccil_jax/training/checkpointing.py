@@ -24,7 +24,7 @@ from ccil_jax.training import manifests
 from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
 from ccil_jax.training.manifests import DamageError, Identity
 from ccil_jax.types import PyTree
-from envs.jax_tools import numbers
+from envs.jax_tools import as_numbers
 
 KEPT = 2  # number of checkpoints that stay on disk: the newest
 _FREE = frozenset({"env_steps"})  # may always differ: a finished training may be continued for longer
@@ -147,7 +147,7 @@ class Checkpointer:
             CheckpointError: the disk is full or fails; or this step, or a later one, is there already: what is saved is
                 never replaced.
         """
-        needed = sum(numbers(leaf).nbytes for leaf in jax.tree.leaves(state)) + _OVERHEAD
+        needed = sum(as_numbers(leaf).nbytes for leaf in jax.tree.leaves(state)) + _OVERHEAD
         free = shutil.disk_usage(self._directory).free
         folder = self._directory / str(step)
         if folder.exists():

@@ -23,7 +23,7 @@ from ccil_jax.training.filesystem import file_sha256
 from ccil_jax.training.versions import versions
 from ccil_jax.types import PyTree
 from envs.base import Environment
-from envs.jax_tools import numbers
+from envs.jax_tools import as_numbers
 
 NAME = "manifest.json"
 
@@ -42,7 +42,7 @@ def _describe(leaf: Any) -> dict[str, Any]:
     facts = {"dtype": str(leaf.dtype), "shape": list(leaf.shape)}
     if isinstance(leaf, jax.ShapeDtypeStruct):
         return facts
-    values = np.ascontiguousarray(numbers(leaf))
+    values = np.ascontiguousarray(as_numbers(leaf))
     return {**facts, "sha256": hashlib.sha256(values.tobytes()).hexdigest()}
 
 

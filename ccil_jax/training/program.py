@@ -31,7 +31,7 @@ from ccil_jax.training import guard
 from ccil_jax.training.guard import GuardedState
 from ccil_jax.types import ExpertData, Metrics
 from envs.base import Environment
-from envs.jax_tools import as_before, full_precision, numbers
+from envs.jax_tools import as_key_like, as_numbers, full_precision
 
 LONGEST_CHUNK = 10  # the most iterations of one call, after which Python logs and may save
 Varied = Mapping[str, jax.Array]  # [R] each: the traced fields that are not the same in all runs, by name
@@ -119,13 +119,13 @@ def _repeat(
 
     def turn(index: jax.Array, carry: tuple[GuardedState, Metrics]) -> tuple[GuardedState, Metrics]:
         plain, rows = carry
-        state_next, metrics = iteration(jax.tree.map(as_before, state, plain))
+        state_next, metrics = iteration(jax.tree.map(as_key_like, state, plain))
         rows = jax.tree.map(lambda row, metric: row.at[index].set(metric), rows, metrics)
-        return jax.tree.map(numbers, state_next), rows
+        return jax.tree.map(as_numbers, state_next), rows
 
     # The loop carries random keys as plain numbers: JAX's check of key reuse cannot follow vmapped keys through a loop.
-    plain, rows = jax.lax.fori_loop(0, length, turn, (jax.tree.map(numbers, state), no_metrics))
-    return jax.tree.map(as_before, state, plain), rows
+    plain, rows = jax.lax.fori_loop(0, length, turn, (jax.tree.map(as_numbers, state), no_metrics))
+    return jax.tree.map(as_key_like, state, plain), rows
 
 
 def _run_chunk(

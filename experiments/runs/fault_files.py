@@ -18,10 +18,10 @@ def write(folder: Path, result: "Result", seed: int) -> Path:
     """Writes fault_seed_N.npz: the state before the fault of one stopped seed, and the run's config.json."""
     import jax
 
-    from envs.jax_tools import numbers
+    from envs.jax_tools import as_numbers
 
     state = jax.tree.map(lambda leaf: leaf[seed], result.state.agent)
-    arrays: dict[str, Any] = {_STATE + name: np.asarray(numbers(leaf)) for name, leaf in _named(state).items()}
+    arrays: dict[str, Any] = {_STATE + name: np.asarray(as_numbers(leaf)) for name, leaf in _named(state).items()}
     path = folder / f"fault_seed_{seed}.npz"
     facts = (folder / "config.json").read_text(encoding="utf-8")
     npz.write(path, {"config": np.array(facts), **arrays})
@@ -45,14 +45,14 @@ def read_state(path: Path, like: Any) -> Any:
     """The state in `path`; `like` gives its structure. Raises `ArchiveError` where it does not fit."""
     import jax
 
-    from envs.jax_tools import is_key, numbers
+    from envs.jax_tools import as_numbers, is_key
 
     names = _named(like)
     arrays = npz.read(path, [_STATE + name for name in names], remedy="use the version that wrote the file")
     leaves = []
     for name, leaf in names.items():
         value = arrays[_STATE + name]
-        shape = jax.eval_shape(numbers, leaf)
+        shape = jax.eval_shape(as_numbers, leaf)
         if (value.shape, value.dtype) != (shape.shape, shape.dtype):
             raise npz.ArchiveError(f"{path}: '{name}' is {value.dtype}{value.shape}; use the version that wrote it")
         leaves.append(jax.random.wrap_key_data(jax.numpy.asarray(value)) if is_key(leaf) else value)
