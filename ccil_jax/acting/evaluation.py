@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,16 +51,15 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
     """Runs `num_episodes` episodes side by side, each from a reset to its end.
 
     Raises:
-        AssertionError: what the policy or the environment returns has another shape than it should.
+        ValueError: the policy returns actions of another shape than the environment takes.
+        AssertionError: the environment returns arrays of other shapes than it should.
     """
     reset_key, key = jax.random.split(key)
     start = jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes))
 
     def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple[State, jax.Array], Trajectories]:
         state, running = carry
-        chosen = policy(state.obs, key)
-        chex.assert_shape(chosen, (num_episodes, env.action_dim))
-        action = jax.vmap(functools.partial(executed, env))(chosen)
+        action = jax.vmap(functools.partial(executed, env))(policy(state.obs, key))
         stepped = jax.vmap(env.step)(state, action)
         check_step(env, stepped, num_episodes)
         steps = Trajectories(
