@@ -161,7 +161,11 @@ def test_a_report_needs_no_animation(folder: Path) -> None:
 def test_a_sweep_trains_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def launch(folders: Sequence[Path], num_workers: int, logs: Path, settings: Mapping[str, Any]) -> backends.Outcomes:
         for job in folders:
-            yield job, None if worker.main([str(job)]) == 0 else "failed"
+            path = job.resolve()
+            monkeypatch.chdir("/")  # as a worker on another machine
+            status = worker.main([str(path)])
+            assert Path.cwd() == folder
+            yield job, None if status == 0 else "failed"
 
     monkeypatch.setattr(backends, "BACKENDS", {"processes": backends.Backend(launch=launch)})
     fixed = {"preset": "tiny", "num_seeds": 1, "eval_episodes": 2, "cost_limit": 5.0, "env_steps": 120}
