@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.methods import _methods
 from experiments import ablations, benchmark, convert, evaluate, expert, report, sweep, train
 from experiments.cli import command_line
 from experiments.cli.names import safe_name
@@ -91,6 +92,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         assert train.main(["--env", TASK, "--method", "ccil", "--demos", "expert.npz", "--out", "run", *TINY]) == 0
         yield folder
     sys.modules.pop("my_task", None)
+    _methods.pop("my_task:LINEAR", None)
 
 
 def refused(capsys: pytest.CaptureFixture[str], launcher: Any, *arguments: str) -> str:
@@ -159,7 +161,11 @@ def test_a_report_needs_no_animation(folder: Path) -> None:
 def test_a_sweep_trains_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def launch(folders: Sequence[Path], num_workers: int, logs: Path, settings: Mapping[str, Any]) -> backends.Outcomes:
         for job in folders:
-            yield job, None if worker.main([str(job)]) == 0 else "failed"
+            path = job.resolve()
+            monkeypatch.chdir("/")  # as a worker on another machine
+            status = worker.main([str(path)])
+            assert Path.cwd() == folder
+            yield job, None if status == 0 else "failed"
 
     monkeypatch.setattr(backends, "BACKENDS", {"processes": backends.Backend(launch=launch)})
     fixed = {"preset": "tiny", "num_seeds": 1, "eval_episodes": 2, "cost_limit": 5.0, "env_steps": 120}

@@ -143,8 +143,14 @@ def write_job(job: Job) -> None:
     job.folder.mkdir(parents=True, exist_ok=True)
     for variant in job.variants:
         variant.plan.folder.mkdir(parents=True, exist_ok=True)
-    content = {"variants": [{"name": v.name, "options": v.options} for v in job.variants]}
+    variants = [{"name": v.name, "options": v.options} for v in job.variants]
+    content = {"started_in": str(Path.cwd()), "variants": variants}
     run_folder.write_json(job.folder / "program.json", content)
+
+
+def started_in(folder: Path) -> Path:
+    """Where the sweep was started whose job is in `folder`: a user's own task or method may be a module there."""
+    return Path(str(run_folder.read_json(folder / "program.json").get("started_in", ".")))
 
 
 def read_job(folder: Path) -> Job:

@@ -35,7 +35,10 @@ def run(arguments: argparse.Namespace) -> None:
         interruption.stop_at_eof()
     if arguments.cpus and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, arguments.cpus)
-    job = variants.read_job(arguments.program)
+    folder = arguments.program.resolve()
+    if (start := variants.started_in(folder)).is_dir():  # Ray starts its workers elsewhere
+        os.chdir(start)
+    job = variants.read_job(folder)
     if all(variant.finished for variant in job.variants):
         return  # the worker before this one died after everything was done
     program = ProgramPlan(
