@@ -194,7 +194,7 @@ def python(code: str, **environment: str) -> str:
 
 @pytest.mark.parametrize("name", ["ccil_jax", "envs", "experiments", "ccil_jax.config", "envs.registry"])
 def test_importing_imports_no_heavy_package(name: str) -> None:
-    heavy = ("jax", "jaxlib", "flax", "optax", "orbax", "brax", "mujoco", "matplotlib", "gymnasium")
+    heavy = ("jax", "jaxlib", "flax", "optax", "orbax", "chex", "brax", "mujoco", "matplotlib", "gymnasium")
     assert python(f"import sys, {name}; print([m for m in {heavy} if m in sys.modules])").strip() == "[]"
 
 
