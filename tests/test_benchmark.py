@@ -14,8 +14,8 @@ import pytest
 from experiments import benchmark, growth
 from experiments.cli.command_line import UsageError
 from experiments.speed import peers, row_processes, tables
+from experiments.speed.locks import file_lock
 from experiments.speed.peers import Peer
-from experiments.speed.turns import turn
 from tests.processes import command_lines, in_proc
 
 SCRIPT = """
@@ -128,16 +128,16 @@ def test_who_measures_is_alone(tmp_path: Path) -> None:
     wait = threading.Event()
 
     def measure() -> None:
-        with turn(file, alone=True):
+        with file_lock(file, exclusive=True):
             wait.set()
 
-    with turn(file, alone=False), turn(file, alone=False):  # they compile side by side
+    with file_lock(file, exclusive=False), file_lock(file, exclusive=False):  # they compile side by side
         thread = threading.Thread(target=measure)
         thread.start()
         assert not wait.wait(0.3)
     thread.join(5)
     assert wait.is_set()
-    with turn(None, alone=True), turn(None, alone=True):
+    with file_lock(None, exclusive=True), file_lock(None, exclusive=True):
         pass
 
 

@@ -47,6 +47,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_the_tasks_keep_their_promises(names: dict[str, Any]) -> None:
     check_environment(names["env"])
     check_environment(names["careful"])
+    check_environment(names["balancing"])
     assert envs.TASKS["Cart"].cost_limit == 5.0
 
 

@@ -23,8 +23,8 @@ from ccil_jax.training import program
 from ccil_jax.types import Batch
 from envs.jax_tools import full_precision
 from envs.task_info import physics_name
+from experiments.speed.locks import file_lock
 from experiments.speed.setting import Setting, make_config, noise
-from experiments.speed.turns import turn
 
 _MOST_SIMS = 1024  # simulations of C MuJoCo that are stepped for comparison, at most
 
@@ -57,7 +57,7 @@ def measure(setting: Setting) -> dict[str, Any]:
     `physics_steps_per_second` is the C engine alone, stepping as many simulations as training does (but see
     `physics_work`) under random controls: the ceiling of the native backend.
     """
-    with turn(setting.turns, alone=False):
+    with file_lock(setting.turns, exclusive=False):
         env: Any = envs.make(setting.task, physics=setting.physics)
         config = make_config(setting)
         training, compile_seconds = training_work(config, env, setting)
@@ -72,7 +72,7 @@ def measure(setting: Setting) -> dict[str, Any]:
         for work in works.values():
             work()  # compiles, and warms caches
     rates: dict[str, list[float]] = {name: [] for name in works}
-    with turn(setting.turns, alone=True):
+    with file_lock(setting.turns, exclusive=True):
         for _ in range(setting.rounds):
             for name, work in works.items():
                 rates[name].append(rate_of(work, setting.seconds))
