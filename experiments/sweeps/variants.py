@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import os
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -143,14 +144,25 @@ def write_job(job: Job) -> None:
     job.folder.mkdir(parents=True, exist_ok=True)
     for variant in job.variants:
         variant.plan.folder.mkdir(parents=True, exist_ok=True)
-    content = {"variants": [{"name": v.name, "options": v.options} for v in job.variants]}
+    pairs = [{"name": v.name, "options": v.options} for v in job.variants]
+    content = {"started_in": str(Path.cwd()), "variants": pairs}
     run_folder.write_json(job.folder / "program.json", content)
 
 
 def read_job(folder: Path) -> Job:
-    """The job that `write_job` left. Raises `UsageError` if it is missing or damaged."""
+    """The job that `write_job` left.
+
+    The current folder becomes the one that the sweep was started in, as far as this machine has it: tasks and methods
+    of the user's own are found from there, and a worker on a cluster may have been started elsewhere.
+
+    Raises:
+        UsageError: the job is missing or damaged.
+    """
+    folder = folder.resolve()
     content = run_folder.read_json(folder / "program.json")
     out = folder.parent.parent
+    if Path(home := str(content.get("started_in", ""))).is_dir() and home:  # earlier versions do not say
+        os.chdir(home)
     try:
         pairs = [(v["name"], v["options"]) for v in content["variants"]]
     except (KeyError, TypeError):
