@@ -104,7 +104,7 @@ def _check(name: str, method: Any) -> None:
     for column in ("agent", "reward", "constraint", "policy"):
         part = getattr(method, column)
         if isinstance(part, str):
-            names = dict.fromkeys(known for row in _BUILT_IN if (known := getattr(row, column)) is not None)
+            names: dict[str, Any] = {known: None for row in _BUILT_IN if (known := getattr(row, column)) is not None}
             function_of(part, names, f"--method {name}: {column}")
     if complaint := _mismatch(method):
         raise ConfigError(f"--method {name}: {complaint}")
