@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeVar
 
 from ccil_jax.errors import ConfigError
+from ccil_jax.presets import PRESETS
 from envs.lookup import hint, named_object
 
 Part = str | Callable[..., Any]
@@ -26,7 +27,7 @@ class Method(NamedTuple):
     policy: Part = "gaussian"
     imitates: bool = True  # whether the method learns from demonstrations
     has_multiplier: bool = False  # whether a Lagrange multiplier is carried from one iteration to the next
-    preset: str = "default"  # the hyperparameters that a launcher starts from, a key of `config.PRESETS`
+    preset: str = "default"  # the hyperparameters that a launcher starts from, a key of `presets.PRESETS`
     reads: tuple[str, ...] = ()  # fields of `Config` that parts of the user's own read
 
 
@@ -44,6 +45,7 @@ _methods: dict[str, Method] = {  # only `register_method` and `find_method` add 
     "expert": Method(reward="task", constraint="lagrangian", limit="prescribed", imitates=False, has_multiplier=True),
 }
 METHODS: Mapping[str, Method] = MappingProxyType(_methods)
+_BUILT_IN = tuple(_methods.values())
 
 
 def register_method(name: str, method: Method) -> None:
@@ -85,21 +87,58 @@ def find_method(name: Any) -> Method:
         method = named_object(name)
     except ValueError as error:
         raise ConfigError(f"--method {error}") from None
+    _check(name, method)
+    row: Method = method
+    _methods[name] = row
+    return row
+
+
+def _check(name: str, method: Any) -> None:
+    """Raises `ConfigError` for parts that are unknown or do not go together.
+
+    Importing the tables of functions would import JAX. Their names are known from the package's own rows, which use
+    every one of them.
+    """
     if not isinstance(method, Method):
         raise ConfigError(f"--method {name}: is of type {type(method).__name__}; name a ccil_jax.Method")
-    _check(name, method)
-    _methods[name] = method
-    return method
+    for column in ("agent", "reward", "constraint", "policy"):
+        part = getattr(method, column)
+        if isinstance(part, str):
+            names: dict[str, Any] = {known: None for row in _BUILT_IN if (known := getattr(row, column)) is not None}
+            function_of(part, names, f"--method {name}: {column}")
+    if complaint := _mismatch(method):
+        raise ConfigError(f"--method {name}: {complaint}")
 
 
-def _check(name: str, method: Method) -> None:
-    """Raises `ConfigError` for parts that do not go together."""
-    if method.agent == "on_policy" and (method.reward is None or method.constraint is None):
-        raise ConfigError(f"method {name}: an on-policy method needs a reward and a constraint; name both")
+def _mismatch(method: Method) -> str | None:
+    """What does not go together in a row whose names are known; None if all does."""
+    of_agent = [row for row in _BUILT_IN if row.agent == method.agent]  # none where the agent is the user's own
     if method.limit not in (None, "demonstrations", "prescribed"):
-        raise ConfigError(f"method {name}: limit {method.limit!r}: give 'demonstrations', 'prescribed' or None")
+        return f"limit {method.limit!r}: give 'demonstrations', 'prescribed' or None"
     if method.limit == "demonstrations" and not method.imitates:
-        raise ConfigError(f"method {name}: has no demonstrations to take its limit from; let limit be 'prescribed'")
+        return "has no demonstrations to take its limit from; let limit be 'prescribed'"
+    if method.preset not in PRESETS:
+        return f"preset {method.preset!r}: unknown; choose one of {', '.join(PRESETS)}"
+    if of_agent and isinstance(method.policy, str) and method.policy not in {row.policy for row in of_agent}:
+        return f"agent {method.agent} has no {method.policy} policy; give {of_agent[0].policy!r} or your own"
+    if not method.imitates and (method.reward == "discriminator" or (of_agent and method.agent != "on_policy")):
+        return "learns from demonstrations; let imitates be True"
+    if method.agent == "on_policy":
+        return _mismatch_on_policy(method)
+    if of_agent and (idle := [part for part in ("reward", "constraint", "limit") if getattr(method, part) is not None]):
+        return f"{idle[0]} makes no difference to agent {method.agent}; leave it out"
+    return None
+
+
+def _mismatch_on_policy(method: Method) -> str | None:
+    if method.reward is None or method.constraint is None:
+        return "an on-policy method needs a reward and a constraint; name both"
+    if method.constraint != "unconstrained" and method.limit is None:
+        return "its constraint needs a limit; let limit be 'demonstrations' or 'prescribed'"
+    multiplier = {row.constraint: row.has_multiplier for row in _BUILT_IN}
+    if method.has_multiplier is not multiplier.get(method.constraint, method.has_multiplier):
+        return f"constraint {method.constraint}: let has_multiplier be {not method.has_multiplier}"
+    return None
 
 
 def function_of(part: Part, table: Mapping[str, Maker], what: str) -> Maker | Callable[..., Any]:

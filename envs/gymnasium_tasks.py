@@ -55,8 +55,9 @@ class _AfterGymnasium(importlib.abc.MetaPathFinder):
         @functools.wraps(execute)
         def execute_and_register(module: ModuleType) -> None:
             execute(module)
-            sys.meta_path.remove(self)
-            register_with_gymnasium()
+            if self in sys.meta_path:  # it is not where somebody has kept an earlier spec and executes that as well
+                sys.meta_path.remove(self)
+                register_with_gymnasium()
 
         spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
         return spec

@@ -14,10 +14,14 @@ import pytest
 
 import ccil_jax
 import envs
+from ccil_jax.acting.networks import POLICIES
+from ccil_jax.agents.build import AGENTS
 from ccil_jax.config import validate
 from ccil_jax.demonstrations import formats
 from ccil_jax.errors import ConfigError
-from ccil_jax.methods import Method, _methods
+from ccil_jax.learning.constraints import CONSTRAINTS
+from ccil_jax.learning.reward_models import REWARD_MODELS
+from ccil_jax.methods import _BUILT_IN, Method, _check, _methods
 from envs import registry
 from envs.testing import check_environment
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
@@ -157,6 +161,15 @@ def test_a_reward_of_another_shape_is_refused() -> None:
         ("x", Method(reward="task"), "method x: an on-policy method needs a reward and a constraint"),
         ("x", Method(reward="task", constraint="pid", limit="mine"), "limit 'mine': give 'demonstrations', 'pre"),  # type: ignore[arg-type]
         ("x", Method(reward="task", constraint="pid", limit="demonstrations", imitates=False), "no demonstrations to"),
+        ("x", "ccil", "method x: is of type str"),
+        ("x", Method(agent="on_polcy"), "agent 'on_polcy': unknown; did you mean on_policy"),
+        ("x", Method(reward="tsk", constraint="unconstrained"), "reward 'tsk': unknown; did you mean task"),
+        ("x", Method(agent="behavior_cloning", preset="bcc"), "preset 'bcc': unknown; choose one of"),
+        ("x", Method(agent="iq_learn"), "agent iq_learn has no gaussian policy; give 'squashed'"),
+        ("x", Method(agent="behavior_cloning", reward="task"), "reward makes no difference to agent behavior_cloning"),
+        ("x", Method(agent="behavior_cloning", imitates=False), "learns from demonstrations; let imitates be True"),
+        ("x", Method(reward="task", constraint="pid"), "its constraint needs a limit"),
+        ("x", Method(reward="task", constraint="pid", limit="prescribed"), "let has_multiplier be True"),
     ],
 )
 def test_rows_that_mean_nothing_are_refused(name: str, method: Method, message: str) -> None:
@@ -164,10 +177,19 @@ def test_rows_that_mean_nothing_are_refused(name: str, method: Method, message: 
         ccil_jax.register_method(name, method)
 
 
+def test_the_rows_of_the_package_name_all_that_the_tables_have() -> None:
+    """The names that a row of the user's own may have are read from them; see `methods._check`."""
+    tables = {"agent": AGENTS, "reward": REWARD_MODELS, "constraint": CONSTRAINTS, "policy": POLICIES}
+    for row in _BUILT_IN:
+        _check("built_in", row)
+    for column, table in tables.items():
+        assert {getattr(row, column) for row in _BUILT_IN} - {None} == set(table)
+
+
 def test_a_method_is_found_by_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "my_methods.py").write_text(
-        "import ccil_jax\n"
-        "SAFE = ccil_jax.Method(reward='discriminator', constraint='pid', limit='demonstrations')\n"
+        "from ccil_jax import Method\n"
+        "SAFE = Method(reward='discriminator', constraint='pid', limit='demonstrations', has_multiplier=True)\n"
         "TEXT = 'pid'\n"
     )
     monkeypatch.chdir(tmp_path)

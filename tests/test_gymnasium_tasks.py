@@ -140,3 +140,14 @@ import gymnasium
 assert "ccil/Swimmer-v0" in gymnasium.registry
 """
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_a_spec_that_somebody_has_kept_can_be_executed_as_well() -> None:
+    program = """
+import importlib.util, envs
+kept = importlib.util.find_spec("gymnasium")
+import gymnasium
+kept.loader.exec_module(importlib.util.module_from_spec(kept))
+assert "ccil/Ant-v0" in gymnasium.registry
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

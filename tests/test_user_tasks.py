@@ -1,5 +1,6 @@
 """A task in a module of the user's own goes through all launchers, by its name `module:function`."""
 
+import dataclasses
 import json
 import re
 import sys
@@ -7,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ccil_jax.demonstrations.trajectories import load_demonstrations
@@ -26,6 +28,7 @@ import numpy as np
 
 import ccil_jax
 from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.agents import behavior_cloning
 from envs.base import executed, first_state, next_state
 
 
@@ -59,6 +62,10 @@ def short(push: float = 0.2):
     return Cart(10, push)
 
 
+def like_a_run(max_episode_steps: int = 20, seed: int = 3, gamma: float = 0.9, method: str = "euler"):
+    return Cart(max_episode_steps)
+
+
 def broken(push):
     return Cart(10, push)
 
@@ -73,6 +80,17 @@ def linear(config, env):
     return ccil_jax.Policy(init, apply)
 
 
+def agent(config, env, expert):
+    plain = behavior_cloning.make(config, env, expert)
+
+    def step(state):
+        state, metrics = plain.step(state)
+        return state, {"my/loss": metrics["loss"]}
+
+    return ccil_jax.Agent(plain.init, step)
+
+
+AGENT = ccil_jax.Method(agent=agent)
 LINEAR = ccil_jax.Method(reward="task", constraint="unconstrained", imitates=False, policy=linear)
 '''
 TASK = "my_task:make"
@@ -150,6 +168,62 @@ def test_a_method_with_a_policy_of_its_own(folder: Path, capsys: pytest.CaptureF
     assert report.main(["linear", "--out", "linear.html"]) == 0
 
 
+def test_an_agent_that_reports_other_metrics(folder: Path) -> None:
+    given = ["--env", TASK, "--method", "my_task:AGENT", "--demos", "expert.npz", "--env-steps", "240", *TINY]
+    assert train.main([*given, "--out", "agent"]) == 0
+    assert read_metrics(Path("agent"))["my/loss"].shape == (2, 2)
+    assert Path("agent/figures/my_loss.png").is_file()
+    assert report.main(["agent", "run", "--out", "agent.html"]) == 0
+
+
+def test_options_of_a_task_may_be_named_like_those_of_a_run(folder: Path) -> None:
+    """Neither demonstrations nor a run that goes on take the one for the other."""
+    given = ["--env", "my_task:like_a_run", *TINY]
+    where = ["--run-dir", "named", "--out"]
+    assert expert.main([*given, "--cost-limit", "20", *where, "named.npz"]) == 0
+    facts = load_demonstrations("named.npz").metadata
+    assert (facts["seed"], facts["method"]) == (0, "expert")
+    assert (facts["env_options"]["seed"], facts["env_options"]["method"]) == (3, "euler")
+    assert train.main([*given, "--method", "gail", "--demos", "named.npz", "--out", "named_gail"]) == 0
+    assert expert.main(["--resume", "--env-steps", "360", *where, "more_named.npz"]) == 0
+    assert run_folder.read_run(Path("named")).config.gamma == 0.995
+
+
+def test_a_run_keeps_the_options_of_its_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the task has other defaults by now."""
+    given = ["--env", TASK, "--method", "bc", "--bc-epochs", "1", "--demos", "expert.npz", "--out", "kept", *TINY]
+    assert train.main(given) == 0
+    monkeypatch.setattr(sys.modules["my_task"].make, "__defaults__", (20, 0.3, ()))
+    with pytest.raises(SystemExit):  # the demonstrations are of the task as it was
+        train.main([*given[:-7], "--out", "other", *TINY])
+    assert train.main(["--resume", "--out", "kept"]) == 0
+    assert run_folder.read_run(Path("kept")).facts["env_options"]["push"] == 0.2
+
+
+def test_a_run_whose_method_is_not_found_is_not_called_damaged(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    facts = run_folder.read_json(Path("run/config.json"))
+    Path("away").mkdir()
+    run_folder.write_json(Path("away/config.json"), {**facts, "config": {**facts["config"], "method": "no_such:ROW"}})
+    said = refused(capsys, evaluate, "away")
+    assert "there is no module 'no_such'; start in the folder that holds it" in said
+    assert "damaged" not in said
+
+
+def test_sizes_that_do_not_fit_leave_no_run_behind(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from ccil_jax.demonstrations.trajectories import save_demonstrations
+
+    found = load_demonstrations(folder / "expert.npz")
+    wide = np.hstack([found.obs, found.obs])
+    save_demonstrations("wide.npz", dataclasses.replace(found, obs=wide))
+    given = ["--env", TASK, "--method", "gail", "--demos", "wide.npz", "--out", "wide", *TINY]
+    with pytest.raises(SystemExit):
+        train.main(given)
+    assert "obs has 4 columns but Cart has 2" in capsys.readouterr().err
+    assert not Path("wide/config.json").exists()
+
+
 def test_a_report_needs_no_animation(folder: Path) -> None:
     assert report.main(["run", "expert", "--out", "page.html", "--figures", "figures"]) == 0
     page = Path("page.html").read_text(encoding="utf-8")
@@ -177,6 +251,16 @@ def test_a_sweep_trains_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert row["episode_length"] == 10.0
     (program,) = Path("sweep/programs").iterdir()
     assert program.name.startswith("my_task_short_expert_")
+    for summary in Path("sweep/runs").glob("*/summary.json"):
+        summary.unlink()
+    elsewhere = folder / "elsewhere"
+    elsewhere.mkdir()
+    job = program.resolve()
+    monkeypatch.chdir(elsewhere)  # as a worker of a cluster may be
+    monkeypatch.delitem(sys.modules, "my_task")
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path not in ("", str(folder))])
+    assert worker.main([str(job)]) == 0
+    assert (folder / "sweep/runs/gamma=0.9/summary.json").is_file()
 
 
 EXPERT = ("--out", "x.npz", "--run-dir", "x")

@@ -13,7 +13,6 @@ from ccil_jax.errors import ConfigError
 from ccil_jax.learning.constraints import Constraint
 from ccil_jax.learning.optimizers import Optimizer
 from ccil_jax.learning.reward_models import RewardModel
-from ccil_jax.methods import function_of
 from ccil_jax.types import ExpertData
 from envs.base import Environment
 from envs.jax_tools import full_precision
@@ -41,7 +40,7 @@ AGENTS: Mapping[str, Kind] = {  # by the names in `METHODS`
 def kind_of(config: Config) -> Kind:
     """How the agent of `config.method` is built. A function of the user's own takes no further parts."""
     part = config.row.agent
-    return AGENTS[part] if isinstance(part, str) and part in AGENTS else Kind(function_of(part, {}, "agent"))
+    return Kind(part) if callable(part) else AGENTS[part]
 
 
 def make(config: Config, env: Environment, expert: ExpertData | None, **own: Any) -> Agent:

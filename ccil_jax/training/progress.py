@@ -73,12 +73,19 @@ class Display:
     def _status(self, progress: Any) -> str:
         latest = {name: _known_mean(rows[-1]) for name, rows in progress.metrics.items()}
         limit = "" if self._cost_limit is None else f" / {number(self._cost_limit)}"
-        if "episode_return" not in latest:  # behaviour cloning: it does not act while it learns
-            return f"loss {number(latest['loss'])}  held out {number(latest['held_out_loss'])}"
-        parts = [f"return {number(latest['episode_return'])}", f"cost {number(latest['episode_cost'])}{limit}"]
+        labels = {"loss": "loss", "held_out_loss": "held out"}  # behaviour cloning does not act while it learns
+        if "episode_return" in latest:
+            labels = {"episode_return": "return", "episode_cost": "cost"}
         if self._has_multiplier:
-            parts.append(f"lambda {number(latest['multiplier'])}")
-        parts.append(f"{progress.env_steps_per_second:,.0f} steps/s")
+            labels["multiplier"] = "lambda"
+        # An agent of the user's own may report other metrics.
+        parts = [
+            f"{label} {number(latest[name])}{limit if name == 'episode_cost' else ''}"
+            for name, label in labels.items()
+            if name in latest
+        ]
+        if "episode_return" in latest:
+            parts.append(f"{progress.env_steps_per_second:,.0f} steps/s")
         return "  ".join(parts)
 
     def _time_left(self, progress: Any, now: float) -> str:

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ccil_jax.config import CHOICES, Config, validate
+from ccil_jax.errors import ConfigError
 from ccil_jax.methods import METHODS
 from ccil_jax.presets import PRESETS
 from ccil_jax.uses import Use
@@ -111,6 +112,8 @@ def config_from(given: Mapping[str, Any], preset: str, saved: Mapping[str, Any] 
     Raises:
         ConfigError: a value is wrong, or a given option makes no difference to the run.
     """
+    if preset not in PRESETS:  # a task or method of the user's own names one, too
+        raise ConfigError(f"--preset {preset!r}: unknown; choose one of {', '.join(PRESETS)}")
     base, changes = ({k: v for k, v in fields.items() if k in CONFIG_FIELDS} for fields in (saved, given))
     config = Config.from_base({**PRESETS[preset], **base}, changes)
     validate(config)
@@ -131,7 +134,8 @@ def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
     """What `envs.make` gets besides the task and the physics.
 
     Defaults are written out, so that they stay the same for a run even if those of the task change. Only a default that
-    JSON cannot hold, which a user's task may have, is left to the task.
+    JSON cannot hold, which a user's task may have, is left to the task. A run that is resumed has its options in
+    `choices` as "env_options"; these come before the task's defaults.
 
     Raises:
         UsageError: the task has no such option, or the option cannot have that value.
@@ -148,7 +152,10 @@ def env_options(choices: Mapping[str, Any], task: TaskInfo) -> dict[str, Any]:
     defaults = {name: value for name, value in task.options.items() if isinstance(value, bool | int | float | str)}
     if has_option(task, "max_episode_steps") and task.max_episode_steps is not None:
         defaults["max_episode_steps"] = task.max_episode_steps
-    return {**defaults, **given}
+    saved = choices.get("env_options", {})
+    if strange := [name for name in saved if not has_option(task, name)]:
+        raise UsageError(f"--resume: the run has option {strange[0]!r}, which {task.name} no longer has; restore it")
+    return {**defaults, **saved, **given}
 
 
 def has_option(task: TaskInfo, name: str) -> bool:

@@ -71,8 +71,11 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         display.message(f"{_announcement(program)}; compiling ...")
         xla.spread_seeds(program.num_runs)
         import envs  # imports JAX, so that it has to wait until the input has been checked
+        from ccil_jax.agents.build import resolve
 
         env = envs.make(setup.task, physics=setup.physics, **setup.env_options)
+        for run in program.runs:  # what does not fit is refused before anything is written
+            resolve(run.config, env, setup.demonstrations)
         todo = {
             i: _with_earlier_commands(run) for i, run in enumerate(program.runs) if run.folder not in program.finished
         }

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.cli.names import safe_name
 from experiments.runs import run_folder
 from experiments.runs.intervals import known_deviation, known_mean
 from experiments.runs.labels import literal
@@ -97,7 +98,7 @@ def draw_run(folder: Path) -> Path:
     target = folder / "figures"
     target.mkdir(exist_ok=True)
     for panel in panels_of([curve]):
-        (target / f"{panel.metric}.png").write_bytes(png(draw_panels([curve], task, [panel.metric])))
+        (target / f"{safe_name(panel.metric)}.png").write_bytes(png(draw_panels([curve], task, [panel.metric])))
     path = target / "curves.png"
     path.write_bytes(png(draw_panels([curve], task)))
     return path
@@ -114,9 +115,15 @@ class Panel:
 
 
 def panels_of(curves: Sequence[Curve]) -> list[Panel]:
-    """The panels that at least one of the curves has something to show in."""
+    """The panels that at least one of the curves has something to show in.
+
+    An agent of the user's own may report none of the usual metrics; then all that it reports is shown.
+    """
+    usual = PANELS + CLONING_PANELS
+    strange = [c.metrics for c in curves if not any(metric in c.metrics for metric, _ in usual)]
+    others = dict.fromkeys(name for metrics in strange for name in metrics if name != "env_steps")
     found = []
-    for metric, title in PANELS + CLONING_PANELS:
+    for metric, title in (*usual, *((name, name) for name in others)):
         for by_passes in (False, True):
             own = {
                 i: c for i, c in enumerate(curves) if metric in c.metrics and (c.steps_per_iteration == 0) is by_passes
@@ -173,7 +180,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Any]:
         for i, curve in panel.curves.items()
     }
     entries |= _draw_levels(axes, list(panel.curves.values()), panel.metric)
-    axes.set_title(panel.title)
+    axes.set_title(literal(panel.title))
     if panel.by_passes:
         axes.set_xlabel("passes over the demonstrations")
     else:

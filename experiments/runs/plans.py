@@ -209,7 +209,7 @@ def find_demonstrations(
     demonstrations = load(path)
     check_matches(demonstrations, path, task)
     for name, used in env_options.items():  # with another definition of the cost, the expert's cost would be no limit
-        recorded = demonstrations.metadata.get(name, used)
+        recorded = _recorded_options(demonstrations).get(name, used)
         if recorded != used:
             option = f"--{name.replace('_', '-')} {recorded}".lower()
             remedy = f"use {option}" if name in options.TASK_OPTIONS else "use demonstrations of the task as it is now"
@@ -221,6 +221,14 @@ def find_demonstrations(
     if "max_episode_steps" in env_options:  # otherwise it is checked when the task has been built
         check_time_limit(demonstrations, path, env_options["max_episode_steps"])
     return path, demonstrations
+
+
+def _recorded_options(demonstrations: Demonstrations) -> Mapping[str, Any]:
+    """The options of the task that was recorded, as far as the file names them."""
+    metadata = demonstrations.metadata
+    if isinstance(named := metadata.get("env_options"), Mapping):
+        return named
+    return {name: metadata[name] for name in options.TASK_OPTIONS if name in metadata}  # written by an earlier version
 
 
 def _shipped(task: str) -> Path:

@@ -84,11 +84,12 @@ def facts(run: Run, summary: Mapping[str, Any], seed_index: int, command: str) -
     (row,) = [row for row in summary["per_seed"] if row["seed"] == seed_index]
     limit = cost_limit(run)
     return {
+        **run.facts["env_options"],  # here earlier versions look for them; the facts below come first
         "task": run.facts["task"],
         "method": run.config.method,
         "cost_limit": limit,
         "limit_kept": None if limit is None else row["episode_cost"] <= limit,
-        **run.facts["env_options"],
+        "env_options": run.facts["env_options"],
         "physics": run.facts["physics"],
         "env_steps": summary["env_steps"],
         "seed": run.facts["seed"],

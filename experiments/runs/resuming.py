@@ -35,8 +35,8 @@ def resumed(
         **relevant(run.config),
         **{name: run.facts[name] for name in ("num_seeds", "seed", "preset", "physics", "eval_episodes")},
         "one_by_one": run.facts.get("one_by_one", False),  # older runs do not say
-        **dict.fromkeys(options.TASK_OPTIONS),  # None where the task has no such option; otherwise:
-        **run.facts["env_options"],
+        **{name: run.facts["env_options"].get(name) for name in options.TASK_OPTIONS},
+        "env_options": run.facts["env_options"],  # apart, as a user's task may name an option like one of the run
         "env": run.facts["task"],
         "num_demos": demos["num_episodes"] if demos else None,
     }

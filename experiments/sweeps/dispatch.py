@@ -106,7 +106,7 @@ def _check_choices(path: Path, choices: Mapping[str, Any]) -> None:
 
 def _wait(jobs: Sequence[Job], arguments: argparse.Namespace) -> int:
     start, num_failed = time.monotonic(), 0
-    by_folder = {job.folder: job for job in jobs}
+    by_folder = {job.folder.resolve(): job for job in jobs}  # a worker may be started in another folder
     launcher = arguments.launcher
     settings, logs = _settings(arguments).get(launcher, {}), arguments.out / launcher
     outcomes = backends.BACKENDS[launcher].launch(list(by_folder), arguments.workers, logs, settings)
