@@ -16,7 +16,8 @@ class Use:
     """Which configurations a field matters to; to all others it makes no difference, so they refuse it."""
 
     reads: Callable[[Method], bool]  # whether the method of a row reads the field
-    note: str = "{methods}"  # completes "used by ..."; {methods} stands for the names of those methods
+    # Completes "used by ..."; {methods} stands for the names of those methods, {others} for those of all others.
+    note: str = "{methods}"
     where: Callable[[Any], bool] = lambda config: True  # what other fields of the `Config` must hold besides
 
     @property
@@ -27,7 +28,8 @@ class Use:
     @property
     def who(self) -> str:
         """Completes "used by ..."."""
-        return self.note.format(methods=", ".join(self.methods))
+        others = (name for name in METHODS if name not in self.methods)
+        return self.note.format(methods=", ".join(self.methods), others=", ".join(others))
 
     def holds(self, config: Any) -> bool:
         """Whether the field matters to `config`."""
@@ -35,8 +37,8 @@ class Use:
 
 
 ALL = Use(lambda row: True, "every method")
-ACTING = Use(lambda row: row.agent != "behavior_cloning", "every method that acts while it learns: all but bc")
-ON_POLICY = Use(lambda row: row.agent == "on_policy", "every on-policy method: all but bc and iq_learn")
+ACTING = Use(lambda row: row.agent != "behavior_cloning", "every method that acts while it learns: all but {others}")
+ON_POLICY = Use(lambda row: row.agent == "on_policy", "every on-policy method: all but {others}")
 ADVERSARIAL = Use(lambda row: row.reward == "discriminator", "methods with a discriminator ({methods})")
 PENALIZED = Use(
     ADVERSARIAL.reads,
@@ -55,12 +57,12 @@ ASCENT = Use(
 )
 PID = Use(
     lambda row: row.constraint in ("lagrangian", "meta_lagrangian", "pid"),
-    "pid_il, and methods with a choice of multiplier whose multiplier_update is pid ({methods})",
+    "{methods} with a pid controller: where multiplier_update is an option, if it is pid",
     lambda config: config.row.constraint == "pid" or config.multiplier_update == "pid",
 )
 MULTIPLIER = Use(
     PID.reads,
-    "pid_il, and methods with a choice of multiplier unless multiplier_update is optimal ({methods})",
+    "{methods}, unless multiplier_update is optimal",
     lambda config: config.has_multiplier,
 )
 MALM = Use(lambda row: row.constraint == "meta_lagrangian")

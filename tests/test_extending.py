@@ -145,6 +145,16 @@ def test_a_row_whose_part_is_unknown_is_refused_before_anything_is_compiled(monk
         ccil_jax.make_agent(walk_config(method="ccil").replace(method="odd"), Walk(), walk_demonstrations())
 
 
+def test_a_metric_named_like_a_column_is_refused() -> None:
+    """A run's table would have the column twice."""
+    constraint = ccil_jax.Constraint(update=lambda state, cost_gap, outer: (state, {"seed": cost_gap}))
+    own = Method(reward="discriminator", constraint=lambda config: constraint, limit="demonstrations")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setitem(_methods, "own", own)
+        with pytest.raises(ConfigError, match="metric 'seed': is a column of every run's own"):
+            ccil_jax.train(walk_config(method="ccil").replace(method="own"), Walk(), walk_demonstrations())
+
+
 def test_a_reward_of_another_shape_is_refused() -> None:
     """NumPy's rules would repeat one number along the batch."""
     model = ccil_jax.RewardModel(lambda state, transition: jnp.mean(transition.obs))

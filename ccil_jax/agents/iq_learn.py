@@ -215,8 +215,8 @@ def make(
 ) -> Agent:
     """Builds the agent: acts in N simulations and after each step makes N `updates_per_step` updates."""
     assert expert is not None and expert.transitions is not None, "iq_learn learns from demonstrations"
-    policy = policy or networks.policy_of(config, env)
-    critic = critic or networks.make_scalar(config, env.obs_dim + env.action_dim)
+    policy = networks.policy_of(config, env) if policy is None else policy
+    critic = networks.make_scalar(config, env.obs_dim + env.action_dim) if critic is None else critic
     update = updates(config, policy, critic, env.action_dim, optimizer)
     parts = Parts(config=config, env=env, policy=policy, expert=expert.transitions, update=update)
     return Agent(init=functools.partial(init, parts), step=functools.partial(step, parts))

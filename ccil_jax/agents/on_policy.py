@@ -89,10 +89,10 @@ def make_parts(
     return Parts(
         config=config,
         env=env,
-        policy=policy or networks.policy_of(config, env),
-        critic=critic or networks.make_scalar(config, env.obs_dim),
+        policy=networks.policy_of(config, env) if policy is None else policy,
+        critic=networks.make_scalar(config, env.obs_dim) if critic is None else critic,
         reward_model=reward_model or reward_models.make(config, env, expert, optimizer),
-        constraint=constraint or constraints.make(config),
+        constraint=constraints.make(config) if constraint is None else constraint,
         optimizer=optimizer,
     )
 

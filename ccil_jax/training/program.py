@@ -26,6 +26,7 @@ from jax.sharding import PartitionSpec as P
 from ccil_jax.agents import build
 from ccil_jax.agents.base import Agent
 from ccil_jax.config import Config
+from ccil_jax.errors import ConfigError
 from ccil_jax.meshes import mesh_of, run_mesh
 from ccil_jax.training import guard
 from ccil_jax.training.guard import GuardedState
@@ -33,6 +34,7 @@ from ccil_jax.types import ExpertData, Metrics
 from envs.base import Environment
 from envs.jax_tools import as_key_like, as_numbers, full_precision
 
+_COLUMNS = {"iteration", "seed", "env_steps"}  # of a run's metrics, beside those that the agent reports
 LONGEST_CHUNK = 10  # the most iterations of one call, after which Python logs and may save
 Varied = Mapping[str, jax.Array]  # [R] each: the traced fields that are not the same in all runs, by name
 NONE_VARIED: Varied = MappingProxyType({})
@@ -113,9 +115,10 @@ def _repeat(
     `length` is an argument of the compiled program, not a constant in it, so that Python can look at the run about once
     a second however long an iteration takes.
     """
-    no_metrics = jax.tree.map(
-        lambda metric: jnp.zeros((chunk_length, *metric.shape), metric.dtype), jax.eval_shape(iteration, state)[1]
-    )
+    _, shapes = jax.eval_shape(iteration, state)
+    if taken := _COLUMNS & shapes.keys():
+        raise ConfigError(f"metric {min(taken)!r}: is a column of every run's own; give it another name")
+    no_metrics = jax.tree.map(lambda metric: jnp.zeros((chunk_length, *metric.shape), metric.dtype), shapes)
 
     def turn(index: jax.Array, carry: tuple[GuardedState, Metrics]) -> tuple[GuardedState, Metrics]:
         plain, rows = carry
