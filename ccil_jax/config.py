@@ -479,8 +479,8 @@ def _check_method(config: Config) -> None:
     """What the method needs of its own fields."""
     if MALM.holds(config) and config.multiplier_update not in ("adam", "sgd"):
         raise ConfigError(
-            f"--multiplier_update {config.multiplier_update}: has no parameter for the outer step of {config.method}; use adam "
-            "or sgd, or --method ccil"
+            f"--multiplier_update {config.multiplier_update}: has no parameter for the outer step of {config.method}; "
+            "use adam or sgd, or --method ccil"
         )
     if config.standardize_cost_advantage and (
         config.row.constraint == "trust_region_optimal" or config.multiplier_update == "optimal"
@@ -491,8 +491,8 @@ def _check_method(config: Config) -> None:
         )
     if META.holds(config) and config.num_held_out == 0:
         raise ConfigError(
-            f"--held_out_fraction {config.held_out_fraction}: the outer loss of {config.method} needs held-out samples; "
-            "use --held_out_fraction 0.3, or --meta_gradient none for the Lagrangian method"
+            f"--held_out_fraction {config.held_out_fraction}: the outer loss of {config.method} needs held-out "
+            "samples; use --held_out_fraction 0.3, or --meta_gradient none for the Lagrangian method"
         )
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
