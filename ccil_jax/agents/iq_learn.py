@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ccil_jax.acting import distributions, networks, rollout
 from ccil_jax.acting.networks import Network
 from ccil_jax.acting.rollout import Actor, RolloutState
-from ccil_jax.agents import replay
+from ccil_jax.agents import contracts, replay
 from ccil_jax.agents.base import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
 from ccil_jax.agents.replay import Replay
 from ccil_jax.config import Config
@@ -215,8 +215,8 @@ def make(
 ) -> Agent:
     """Builds the agent: acts in N simulations and after each step makes N `updates_per_step` updates."""
     assert expert is not None and expert.transitions is not None, "iq_learn learns from demonstrations"
-    policy = policy or networks.policy_of(config, env)
-    critic = critic or networks.make_scalar(config, env.obs_dim + env.action_dim)
+    policy = contracts.squashed_policy(policy or networks.policy_of(config, env), env.action_dim)
+    critic = contracts.critic(critic or networks.make_scalar(config, env.obs_dim + env.action_dim))
     update = updates(config, policy, critic, env.action_dim, optimizer)
     parts = Parts(config=config, env=env, policy=policy, expert=expert.transitions, update=update)
     return Agent(init=functools.partial(init, parts), step=functools.partial(step, parts))

@@ -15,6 +15,7 @@ import numpy as np
 
 from ccil_jax.config import Config, check_types
 from ccil_jax.errors import ConfigError
+from ccil_jax.methods import find_method
 from ccil_jax.training.versions import versions
 from envs import registry
 from envs.registry import TASKS, TaskInfo
@@ -96,6 +97,10 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
         facts["env_options"] = {name: value for name, value in facts["env_options"].items() if name in known}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
     config = Config(**values)
+    try:
+        find_method(config.method)
+    except ConfigError as error:  # a user's own method is known only where its module is
+        raise UsageError(f"{path}: {error}") from None
     try:
         check_types(config)
     except ConfigError as error:
