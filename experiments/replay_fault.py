@@ -15,6 +15,7 @@ from ccil_jax.training.filesystem import file_sha256
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
 from experiments.runs import fault_files, run_folder
+from experiments.runs.environments import build_environment
 
 
 def make_parser() -> Parser:
@@ -47,13 +48,12 @@ def replay(path: Path, demos: Path | None = None) -> list[str]:
 
     import jax
 
-    import envs
     from ccil_jax.agents import build
     from ccil_jax.agents.expert import expert_data
     from ccil_jax.training import guard
     from envs.jax_tools import full_precision
 
-    env = envs.make(task.name, physics=run.facts["physics"], **run.facts["env_options"])
+    env = build_environment(task.name, run.facts["physics"], run.facts["env_options"])
     config = build.resolve(run.config, env, demonstrations)
     agent = build.make(config, env, expert_data(demonstrations))
     state = fault_files.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))

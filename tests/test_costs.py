@@ -119,3 +119,9 @@ def test_a_cost_of_another_shape_is_refused() -> None:
     env = envs.with_cost(Walk(), lambda before, action, after: action)
     with pytest.raises(ValueError, match=r"Walk: cost must have shape \(\), but has shape \(1,\)"):
         jax.eval_shape(env.step, env.reset(jax.random.key(0)), jnp.zeros(1))
+
+
+def test_the_check_of_a_task_allows_real_costs_their_rounding() -> None:
+    """Summed in another order, 20 squares differ in their last bits; sums of 0 and 1 do not."""
+    swimmer = envs.make("Swimmer", max_episode_steps=20)
+    check_environment(envs.with_cost(swimmer, lambda before, action, after: jnp.sum(action**2)))

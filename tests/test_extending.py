@@ -14,6 +14,7 @@ import pytest
 
 import ccil_jax
 import envs
+from ccil_jax.acting.distributions import Gaussian
 from ccil_jax.acting.networks import POLICIES
 from ccil_jax.agents.build import AGENTS
 from ccil_jax.config import validate
@@ -159,8 +160,75 @@ def test_a_reward_of_another_shape_is_refused() -> None:
     """NumPy's rules would repeat one number along the batch."""
     model = ccil_jax.RewardModel(lambda state, transition: jnp.mean(transition.obs))
     agent = ccil_jax.make_agent(walk_config(method="gail"), Walk(), walk_demonstrations(), reward_model=model)
-    with pytest.raises(AssertionError, match="the reward model's rewards must be"):
+    with pytest.raises(ConfigError, match=r"reward: returned an array of shape \(\); return one reward for each step"):
         agent.step(agent.init(jax.random.key(0)))
+
+
+ZERO = jnp.zeros(())
+
+
+def gaussian(**leaves: Any) -> ccil_jax.Policy:
+    def apply(params: Any, obs: jax.Array) -> Gaussian:
+        return Gaussian(**{"mean": obs[..., :1], "log_std": ZERO} | leaves)
+
+    return ccil_jax.Policy(lambda key: ZERO, apply)
+
+
+def trace(method: str, **parts: Any) -> None:
+    """One iteration of an agent with these parts, without computing anything."""
+    agent = ccil_jax.make_agent(walk_config(method=method), Walk(), walk_demonstrations(), **parts)
+    jax.eval_shape(lambda key: agent.step(agent.init(key)), jax.random.key(0))
+
+
+def constraint(**functions: Any) -> ccil_jax.Constraint:
+    return ccil_jax.Constraint(init=lambda: ZERO)._replace(**functions)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        ({"constraint": lambda config: None}, "constraint: is of type function; give a ccil_jax.Constraint"),
+        ({"constraint": constraint(multiplier=lambda state: jnp.zeros(2))}, r"multiplier: returned .*\(2,\); return l"),
+        ({"constraint": constraint(gate=lambda *_: ZERO)}, r"gate: returned an array of shape \(\)"),
+        ({"constraint": constraint(combine=lambda *_: jnp.zeros(3))}, r"combine: returned an array of shape \(3,\)"),
+        ({"constraint": constraint(combine=lambda *_: (1.0, 0.0))}, "combine: returned tuple"),
+        ({"constraint": constraint(combine=lambda state: ZERO)}, "combine: calling it raised TypeError: .*but 3 were"),
+        ({"constraint": constraint(combine=lambda *_: [][0])}, r"test_extending.py, line \d+, raised IndexError: list"),
+        ({"constraint": constraint(update=lambda state, *_: state)}, "update: returned an array; return the new state"),
+        ({"constraint": constraint(update=lambda *_: (jnp.zeros(2), {}))}, r"it is float32\[2\], not float32\[\]"),
+        ({"constraint": constraint(update=lambda *_: ((), {}))}, "its parts have other names"),
+        ({"constraint": constraint(update=lambda s, *_: (s, {"m": jnp.ones(2)}))}, "metric 'm': returned an array of"),
+        ({"constraint": constraint(update=lambda s, *_: (s, {"kl": s}))}, "constraint.update: metric 'kl' is there"),
+        ({"policy": gaussian(mean=jnp.zeros(2))}, r"mean: returned an array of shape \(2,\)"),
+        ({"policy": gaussian(log_std=jnp.zeros((4, 1)))}, "log-deviations that are the same in every state"),
+        ({"policy": (lambda key: ZERO, 0)}, "policy: is of type tuple; give a ccil_jax.Policy"),
+        ({"critic": ccil_jax.Network(lambda key: ZERO, lambda params, obs: obs)}, "critic.apply: returned an array of"),
+        ({"optimizer": optax.adam(1.0)}, "optimizer: calling it raised TypeError: .* not callable"),
+        ({"optimizer": lambda learning_rate: None}, "optimizer: returned NoneType; return an optax.Gradient"),
+    ],
+)
+def test_what_a_part_returns_is_checked(part: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        trace("ccil", **part)
+
+
+def test_an_actor_is_played_with_its_own_policy() -> None:
+    """The parameters of another network would end in an error from deep within the method's own."""
+    config, policy = walk_config(method="gail"), gaussian(log_std=jnp.zeros(1))
+    agent = ccil_jax.make_agent(config, Walk(), walk_demonstrations(), policy=policy)
+    actor = jax.vmap(agent.init)(jax.random.split(jax.random.key(0), 2)).actor
+    assert ccil_jax.evaluate(config, actor, Walk(), num_episodes=1, policy=policy).episode_return.shape == (2, 1)
+    with pytest.raises(ConfigError, match=r"actor: .* are not those of the policy of gail .*; give the `policy` that"):
+        ccil_jax.evaluate(config, actor, Walk(), num_episodes=1)
+    with pytest.raises(ConfigError, match=r"it is float32\[2\], not float32\[\]"):
+        ccil_jax.record(config, jax.tree.map(lambda leaf: leaf[:2], actor), Walk(), num_episodes=1, policy=policy)
+
+
+def test_iq_learn_takes_a_squashed_policy_only() -> None:
+    """A `Gaussian` has no bounded actions, whose densities its updates need."""
+    policy = ccil_jax.Policy(lambda key: ZERO, lambda params, obs: Gaussian(mean=obs, log_std=ZERO))
+    with pytest.raises(ConfigError, match="returned Gaussian; return a TanhGaussian"):
+        trace("iq_learn", policy=policy)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from ccil_jax.learning import regression
@@ -83,3 +84,24 @@ def test_a_network_that_returns_a_column_is_refused() -> None:
         fit(obs, target, np.ones((2, 1), np.float32))
     with pytest.raises(AssertionError, match=r"\(8, 1\)"):
         fit(obs, target[:, None], np.ones(2, np.float32))
+
+
+def test_an_optimizer_may_use_the_parameters() -> None:
+    """Decoupled weight decay: with targets that are met, parameters shrink by the learning rate times the decay."""
+
+    def decaying(learning_rate: Any) -> optax.GradientTransformation:
+        return optax.adamw(learning_rate, weight_decay=0.5)
+
+    critic = regression.init(jnp.ones(1), 0.1, decaying)
+    found, _ = regression.fit(
+        lambda params, obs: 0 * params[0] + obs[:, 0],
+        critic,
+        jnp.ones((4, 1)),
+        jnp.ones(4),
+        jax.random.key(0),
+        learning_rate=0.1,
+        num_epochs=1,
+        minibatch_size=4,
+        optimizer=decaying,
+    )
+    np.testing.assert_allclose(found.params, [0.95], rtol=1e-6)

@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 
 from ccil_jax.demonstrations.trajectories import load_demonstrations
+from ccil_jax.errors import UserError
 from ccil_jax.methods import _methods
 from experiments import ablations, benchmark, convert, evaluate, expert, report, sweep, train
 from experiments.cli import command_line
 from experiments.cli.names import safe_name
 from experiments.runs import run_folder
+from experiments.runs.environments import build_environment
 from experiments.runs.metrics_file import read_metrics
 from experiments.sweeps import backends, worker
 from tests.probe_envs import quick_compilation
@@ -111,6 +113,74 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
     sys.modules.pop("my_task", None)
     _methods.pop("my_task:LINEAR", None)
+
+
+BROKEN = """
+import jax.numpy as jnp
+from my_task import Cart
+
+
+class Long(Cart):
+    obs_dim = 5
+
+
+class Column(Cart):
+    def step(self, state, action):
+        return super().step(state, action).replace(cost=jnp.zeros(1))
+
+
+class Whole(Cart):
+    def step(self, state, action):
+        return super().step(state, action).replace(cost=jnp.zeros((), int))
+
+
+class Silent(Cart):
+    def step(self, state, action):
+        pass
+
+
+class Wrong(Cart):
+    def step(self, state, action):
+        return state.observation
+
+
+class Unlicensed(Cart):
+    def __init__(self):
+        raise RuntimeError("no licence")
+
+
+class Empty:
+    pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("Long", r"obs after reset has shape \(2,\); make it \(5,\)"),
+        ("Column", r"cost after step has shape \(1,\); make it \(\)"),
+        ("Whole", r"cost is int32\[\], not float32\[\]"),
+        ("Silent", "step returned NoneType; return an envs.State"),
+        ("Wrong", r"step: broken_tasks.py, line \d+, raised AttributeError: .*; correct that function"),
+        ("Unlicensed", r"broken_tasks.py, line \d+, raised RuntimeError: no licence"),
+        ("Empty", "has no name, obs_dim, .*; return an envs.Environment"),
+    ],
+)
+def test_a_task_that_breaks_its_promises_is_one_line(folder: Path, task: str, message: str) -> None:
+    (folder / "broken_tasks.py").write_text(BROKEN, encoding="utf-8")
+    with pytest.raises(UserError, match=rf"env broken_tasks:{task}: (.*\W)?{message}"):
+        build_environment(f"broken_tasks:{task}", "auto", {})
+
+
+def test_another_folder_does_not_know_the_method_but_the_run_is_whole(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    facts = run_folder.read_json(Path("run/config.json"))
+    facts["config"]["method"] = "elsewhere:NEAR"
+    (tmp_path / "config.json").write_text(json.dumps(facts), encoding="utf-8")
+    said = refused(capsys, evaluate, str(tmp_path))
+    assert "there is no module 'elsewhere'; start in the folder that holds it" in said
+    assert "damaged" not in said
 
 
 def refused(capsys: pytest.CaptureFixture[str], launcher: Any, *arguments: str) -> str:

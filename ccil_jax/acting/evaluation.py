@@ -15,7 +15,9 @@ from ccil_jax.acting.networks import Policy
 from ccil_jax.acting.rollout import Actor, act, check_step
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.errors import ConfigError
 from ccil_jax.meshes import run_mesh, usable_devices
+from ccil_jax.trees import difference
 from ccil_jax.types import PyTree
 from envs.base import Environment, State, executed
 from envs.jax_tools import full_precision
@@ -81,6 +83,11 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
 
 def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool, policy: Policy | None) -> Act:
     policy = networks.policy_of(config, env) if policy is None else policy
+    if differs := difference(jax.eval_shape(policy.init, jax.random.key(0)), actor.policy_params):
+        raise ConfigError(
+            f"actor: its parameters are not those of the policy of {config.method} ({differs}); give the `policy` that "
+            "it was trained with, to `evaluate` the actors of all seeds, and to `record` that of one seed"
+        )
 
     def policy_act(obs: jax.Array, key: jax.Array) -> jax.Array:
         shape = (*obs.shape[:-1], env.action_dim)

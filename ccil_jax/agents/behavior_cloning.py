@@ -11,6 +11,7 @@ from ccil_jax.acting import distributions, networks, running_statistics
 from ccil_jax.acting.distributions import Gaussian
 from ccil_jax.acting.networks import Policy
 from ccil_jax.acting.rollout import Actor
+from ccil_jax.agents import contracts
 from ccil_jax.agents.base import Agent
 from ccil_jax.config import Config
 from ccil_jax.learning.minibatches import minibatches
@@ -56,7 +57,7 @@ def make(
 ) -> Agent:
     """Builds the agent; an iteration is one pass over the demonstrations."""
     assert expert is not None, "bc learns from demonstrations"
-    policy = networks.policy_of(config, env) if policy is None else policy
+    policy = contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim)
     apply, rule = policy.apply, optimizer(config.actor_learning_rate)
     statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
     obs = running_statistics.normalize(statistics, expert.obs)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from ccil_jax.acting.networks import Network, Policy
-from ccil_jax.agents import behavior_cloning, iq_learn, on_policy
+from ccil_jax.agents import behavior_cloning, contracts, iq_learn, on_policy
 from ccil_jax.agents.base import Agent
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config, validate, with_limit_of
@@ -64,6 +64,8 @@ def make(config: Config, env: Environment, expert: ExpertData | None, **own: Any
             )
     if "constraint" in own and config.row.limit is None:
         raise ConfigError(f"constraint: method {config.method} has no cost limit to keep; use ccil, or lgail")
+    if "optimizer" in own:
+        own["optimizer"] = contracts.optimizer(own["optimizer"])
     return kind.make(config, env, expert, **own)
 
 

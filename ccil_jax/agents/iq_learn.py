@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from ccil_jax.acting import distributions, networks, rollout
 from ccil_jax.acting.networks import Network
 from ccil_jax.acting.rollout import Actor, RolloutState
-from ccil_jax.agents import replay
+from ccil_jax.agents import contracts, replay
 from ccil_jax.agents.base import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
 from ccil_jax.agents.replay import Replay
 from ccil_jax.config import Config
@@ -216,7 +216,9 @@ def make(
     """Builds the agent: acts in N simulations and after each step makes N `updates_per_step` updates."""
     assert expert is not None and expert.transitions is not None, "iq_learn learns from demonstrations"
     policy = networks.policy_of(config, env) if policy is None else policy
+    policy = contracts.squashed_policy(policy, env.action_dim)
     critic = networks.make_scalar(config, env.obs_dim + env.action_dim) if critic is None else critic
+    critic = contracts.critic(critic)
     update = updates(config, policy, critic, env.action_dim, optimizer)
     parts = Parts(config=config, env=env, policy=policy, expert=expert.transitions, update=update)
     return Agent(init=functools.partial(init, parts), step=functools.partial(step, parts))

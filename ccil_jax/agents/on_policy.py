@@ -8,7 +8,6 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -16,6 +15,7 @@ from flax import struct
 from ccil_jax.acting import distributions, networks, rollout, running_statistics
 from ccil_jax.acting.networks import Network, Policy
 from ccil_jax.acting.rollout import Actor, RolloutState
+from ccil_jax.agents import contracts
 from ccil_jax.agents.base import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
 from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step, regression, reward_models
@@ -89,10 +89,12 @@ def make_parts(
     return Parts(
         config=config,
         env=env,
-        policy=networks.policy_of(config, env) if policy is None else policy,
-        critic=networks.make_scalar(config, env.obs_dim) if critic is None else critic,
-        reward_model=reward_model or reward_models.make(config, env, expert, optimizer),
-        constraint=constraints.make(config) if constraint is None else constraint,
+        policy=contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim),
+        critic=contracts.critic(networks.make_scalar(config, env.obs_dim) if critic is None else critic),
+        reward_model=contracts.reward_model(
+            reward_models.make(config, env, expert, optimizer) if reward_model is None else reward_model
+        ),
+        constraint=contracts.constraint(constraints.make(config) if constraint is None else constraint),
         optimizer=optimizer,
     )
 
@@ -156,7 +158,7 @@ def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
         iteration=iteration,
         key=key,
     )
-    return new, metrics | reward_metrics | constraint_metrics
+    return new, contracts.join_metrics(metrics, reward_model=reward_metrics, constraint=constraint_metrics)
 
 
 def generator_steps(parts: Parts, state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
@@ -255,11 +257,9 @@ def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Bat
 
     obs = normalize(transition.obs)
     reward = parts.reward_model.reward(state.reward_model, transition)
-    chex.assert_equal_shape([reward, transition.cost], custom_message="the reward model's rewards must be [T, N]")
     signals = jnp.stack([reward, transition.cost])
     no_future = transition.terminated if config.bootstrap_at_truncation else transition.done
     value = values(obs)
-    chex.assert_shape(value, (2, *transition.cost.shape), custom_message="a critic maps [..., obs_dim] to [...]")
     next_value = successor_values(
         lambda obs: values(normalize(obs)), value, transition.next_obs, no_future, transition.done
     )

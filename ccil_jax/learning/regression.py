@@ -71,7 +71,7 @@ def fit(
 
     def descend(critic: Critic, indices: jax.Array) -> tuple[Critic, jax.Array]:
         value, gradient = jax.value_and_grad(loss)(critic.params, indices)
-        updates, optimizer_state = rule.update(gradient, critic.optimizer)
+        updates, optimizer_state = rule.update(gradient, critic.optimizer, critic.params)
         return Critic(params=optax.apply_updates(critic.params, updates), optimizer=optimizer_state), value
 
     indices = minibatches(key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=num_epochs)

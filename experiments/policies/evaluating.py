@@ -6,6 +6,7 @@ from typing import Any
 from ccil_jax.config import Config
 from envs.registry import TaskInfo
 from experiments.runs import run_folder, summary
+from experiments.runs.environments import build_environment
 from experiments.runs.provenance import provenance
 from experiments.runs.run_folder import Run
 
@@ -39,10 +40,9 @@ def load(run: Run) -> Loaded:
         UserError: the task is not known here, or the checkpoint cannot be read.
     """
     task = run_folder.task_of(run)
-    import envs  # imports JAX, so that it has to wait until the input has been checked
     from ccil_jax.training import runner
 
-    env = envs.make(task.name, physics=run.facts["physics"], **run.facts["env_options"])
+    env = build_environment(task.name, run.facts["physics"], run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
     return Loaded(run=run, task=task, env=env, config=loaded.config, actor=loaded.actor)
 

@@ -12,6 +12,7 @@ from ccil_jax.training.progress import Display
 from experiments.cli import xla
 from experiments.cli.interruption import Interruption
 from experiments.runs import fault_files, run_folder, summary
+from experiments.runs.environments import build_environment
 from experiments.runs.metrics_file import read_metrics
 from experiments.runs.plans import ProgramPlan, RunPlan, Setup
 from experiments.runs.run_log import RunLog, write_config
@@ -70,10 +71,11 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
     ):
         display.message(f"{_announcement(program)}; compiling ...")
         xla.spread_seeds(program.num_runs)
-        import envs  # imports JAX, so that it has to wait until the input has been checked
-        from ccil_jax.agents.build import resolve
+        from ccil_jax.agents.build import (
+            resolve,  # imports JAX, so that it has to wait until the input has been checked
+        )
 
-        env = envs.make(setup.task, physics=setup.physics, **setup.env_options)
+        env = build_environment(setup.task, setup.physics, setup.env_options)
         for run in program.runs:  # what does not fit is refused before anything is written
             resolve(run.config, env, setup.demonstrations)
         todo = {
