@@ -146,6 +146,21 @@ def test_a_row_whose_part_is_unknown_is_refused_before_anything_is_compiled(monk
         ccil_jax.make_agent(walk_config(method="ccil").replace(method="odd"), Walk(), walk_demonstrations())
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (("ccil", Walk(), None), "config: is of type str; give a ccil_jax.Config"),
+        ((walk_config(method="ccil"), "Swimmer", None), "env: is 'Swimmer'; give an environment, such as"),
+        ((walk_config(method="ccil"), Walk, None), "env: is <class .*Walk'>; give an environment, such as"),
+        ((walk_config(method="ccil"), Walk(), "file.npz"), "demonstrations: is of type str; give what"),
+    ],
+)
+def test_names_are_not_what_they_name(given: Any, message: str) -> None:
+    for function in (ccil_jax.make_agent, ccil_jax.train):
+        with pytest.raises(ConfigError, match=message):
+            function(*given)
+
+
 def test_a_metric_named_like_a_column_is_refused() -> None:
     """A run's table would have the column twice."""
     constraint = ccil_jax.Constraint(update=lambda state, cost_gap, outer: (state, {"seed": cost_gap}))

@@ -2,7 +2,6 @@
 
 import math
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -30,14 +29,10 @@ def sample(distribution: Gaussian | TanhGaussian, noise: Float[Array, "... A"]) 
     """The actions that standard normal `noise` maps to: mean + std * noise, squashed where the distribution is.
 
     Zero noise gives the mode (that of the Gaussian before it is squashed).
-
-    Raises:
-        AssertionError: the distribution's means have another shape than the noise.
     """
     if isinstance(distribution, TanhGaussian):
         unit = jnp.tanh(sample(distribution.gaussian, noise))
         return _wide(distribution.center, unit) + _wide(distribution.half_range, unit) * unit
-    chex.assert_equal_shape([distribution.mean, noise])
     return distribution.mean + _wide(jnp.exp(distribution.log_std), noise) * noise
 
 

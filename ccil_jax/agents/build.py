@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from ccil_jax import own
 from ccil_jax.acting.networks import Network, Policy
 from ccil_jax.agents import behavior_cloning, contracts, iq_learn, on_policy
 from ccil_jax.agents.base import Agent
@@ -97,7 +98,8 @@ def make_agent(
         constraint: how the cost enters, instead of the method's own.
         reward_model: where the reward comes from, instead of the method's own.
         policy: the policy network, instead of the method's own. Its `apply(params, obs)` returns a
-            `ccil_jax.acting.distributions.Gaussian` with means [..., action_dim] and log-deviations [action_dim].
+            `Gaussian` of `ccil_jax.acting.distributions` with means [..., action_dim] and log-deviations [action_dim];
+            for `iq_learn` a `TanhGaussian`, whose log-deviations are [..., action_dim].
         critic: the network of a value function, [..., obs_dim] -> [...]; the reward's and the cost's critic are two
             sets of its parameters. For `iq_learn` it is the Q-function, [..., obs_dim + action_dim] -> [...].
         optimizer: learning rate -> `optax.GradientTransformation`, instead of Adam, for critics and discriminator,
@@ -127,6 +129,7 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         ConfigError: options, environment and demonstrations do not fit together.
         DemonstrationsError: an episode of the demonstrations is longer than the environment's.
     """
+    _check_types(config, env, demonstrations)
     validate(config)
     if config.row.imitates:
         if demonstrations is None:
@@ -143,3 +146,14 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
         return config
     config = with_limit_of(config, demonstrations.mean_episode_cost)
     return kind_of(config).resolve(config, env, demonstrations)
+
+
+def _check_types(config: Any, env: Any, demonstrations: Any) -> None:
+    """Raises `ConfigError` for names in the place of what they name, and for classes in the place of their objects."""
+    own.check_type("config", config, Config)
+    if isinstance(env, str | type) or not hasattr(env, "reset"):
+        found = repr(env) if isinstance(env, str | type) else f"of type {type(env).__name__}"
+        raise ConfigError(f"env: is {found}; give an environment, such as envs.make('Swimmer')")
+    if demonstrations is not None and not isinstance(demonstrations, Demonstrations):
+        found = type(demonstrations).__name__
+        raise ConfigError(f"demonstrations: is of type {found}; give what ccil_jax.load_demonstrations returns")
