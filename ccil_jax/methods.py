@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeVar
 
-from ccil_jax import own
+from ccil_jax import user_code
 from ccil_jax.errors import ConfigError
 from ccil_jax.presets import PRESETS
 from envs.lookup import hint, named_object
@@ -65,7 +65,7 @@ def register_method(name: str, method: Method) -> None:
     """
     if not name.isidentifier():
         raise ConfigError(f"method {name!r}: not an identifier; use letters, digits and underscores")
-    own.check_type(f"method {name}", method, Method)
+    user_code.check_type(f"method {name}", method, Method)
     if name in _methods:
         raise ConfigError(f"method {name}: is registered already; choose another name")
     _check(name, method)
@@ -151,7 +151,7 @@ def function_of(part: Part, table: Mapping[str, Maker], what: str) -> Maker | Ca
         ConfigError: the table has no such name.
     """
     if callable(part):
-        return functools.partial(own.call, what, part)
+        return functools.partial(user_code.call, what, part)
     if part not in table:
         raise ConfigError(f"{what} {part!r}: unknown; {hint(part, list(table))}choose one of {', '.join(table)}")
     return table[part]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from ccil_jax import own
+from ccil_jax import user_code
 from ccil_jax.acting.networks import Network, Policy
 from ccil_jax.agents import behavior_cloning, contracts, iq_learn, on_policy
 from ccil_jax.agents.base import Agent
@@ -150,7 +150,7 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
 
 def _check_types(config: Any, env: Any, demonstrations: Any) -> None:
     """Raises `ConfigError` for names in the place of what they name, and for classes in the place of their objects."""
-    own.check_type("config", config, Config)
+    user_code.check_type("config", config, Config)
     if isinstance(env, str | type) or not hasattr(env, "reset"):
         found = repr(env) if isinstance(env, str | type) else f"of type {type(env).__name__}"
         raise ConfigError(f"env: is {found}; give an environment, such as envs.make('Swimmer')")

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import optax
 
-from ccil_jax import own
+from ccil_jax import user_code
 from ccil_jax.acting.distributions import Gaussian, TanhGaussian
 from ccil_jax.acting.networks import Network, Policy, SquashedPolicy
 from ccil_jax.errors import ConfigError
@@ -35,7 +35,7 @@ def _updating(what: str, update: Callable[..., Any]) -> Callable[..., tuple[PyTr
     """An `update` that has to return a state like its first argument, and metrics that are numbers."""
 
     def checked(state: PyTree, *arguments: Any) -> tuple[PyTree, Metrics]:
-        result = own.call(what, update, state, *arguments)
+        result = user_code.call(what, update, state, *arguments)
         if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], dict)):
             returned = "an array" if isinstance(result, jax.Array) else type(result).__name__
             raise ConfigError(
@@ -52,25 +52,25 @@ def _updating(what: str, update: Callable[..., Any]) -> Callable[..., tuple[PyTr
 
 def constraint(part: Constraint) -> Constraint:
     """`part`, checked: lambda [], gated advantages [T, N], weights [2], and the state after `update`."""
-    own.check_type("constraint", part, Constraint)
+    user_code.check_type("constraint", part, Constraint)
 
     def multiplier(state: PyTree) -> jax.Array:
-        value: jax.Array = own.call("constraint.multiplier", part.multiplier, state)
+        value: jax.Array = user_code.call("constraint.multiplier", part.multiplier, state)
         _check_shape("constraint.multiplier", value, (), "lambda")
         return value
 
     def gate(reward_advantage: jax.Array, *arguments: Any) -> jax.Array:
-        value: jax.Array = own.call("constraint.gate", part.gate, reward_advantage, *arguments)
+        value: jax.Array = user_code.call("constraint.gate", part.gate, reward_advantage, *arguments)
         _check_shape("constraint.gate", value, reward_advantage.shape, "the advantages [T, N] to ascend")
         return value
 
     def combine(*arguments: jax.Array) -> jax.Array:
-        weights: jax.Array = own.call("constraint.combine", part.combine, *arguments)
+        weights: jax.Array = user_code.call("constraint.combine", part.combine, *arguments)
         _check_shape("constraint.combine", weights, (2,), "the weights (w_r, w_c)")
         return weights
 
     return part._replace(
-        init=functools.partial(own.call, "constraint.init", part.init),
+        init=functools.partial(user_code.call, "constraint.init", part.init),
         multiplier=multiplier,
         gate=gate,
         combine=combine,
@@ -80,49 +80,49 @@ def constraint(part: Constraint) -> Constraint:
 
 def reward_model(part: RewardModel) -> RewardModel:
     """`part`, checked: rewards [T, N], and the state after `update`."""
-    own.check_type("reward_model", part, RewardModel)
+    user_code.check_type("reward_model", part, RewardModel)
 
     def reward(state: PyTree, transition: Any) -> jax.Array:
-        value: jax.Array = own.call("reward_model.reward", part.reward, state, transition)
+        value: jax.Array = user_code.call("reward_model.reward", part.reward, state, transition)
         _check_shape("reward_model.reward", value, transition.cost.shape, "one reward for each step, [T, N]")
         return value
 
     return part._replace(
         reward=reward,
-        init=functools.partial(own.call, "reward_model.init", part.init),
+        init=functools.partial(user_code.call, "reward_model.init", part.init),
         update=_updating("reward_model.update", part.update),
     )
 
 
 def policy(part: Policy, action_dim: int) -> Policy:
     """`part`, checked: a `Gaussian` with means [..., action_dim] and log-deviations [action_dim]."""
-    own.check_type("policy", part, Policy)
+    user_code.check_type("policy", part, Policy)
 
     def apply(params: PyTree, obs: jax.Array) -> Gaussian:
-        distribution: Gaussian = own.call("policy.apply", part.apply, params, obs)
+        distribution: Gaussian = user_code.call("policy.apply", part.apply, params, obs)
         _check_gaussian(distribution, Gaussian)
         _check_shape("policy.apply: mean", distribution.mean, (*obs.shape[:-1], action_dim), "the means")
         meaning = "log-deviations that are the same in every state"
         _check_shape("policy.apply: log_std", distribution.log_std, (action_dim,), meaning)
         return distribution
 
-    return part._replace(init=functools.partial(own.call, "policy.init", part.init), apply=apply)
+    return part._replace(init=functools.partial(user_code.call, "policy.init", part.init), apply=apply)
 
 
 def squashed_policy(part: Policy | SquashedPolicy, action_dim: int) -> SquashedPolicy:
     """`part`, checked: a `TanhGaussian` whose means and log-deviations are [..., action_dim]."""
     if not isinstance(part, SquashedPolicy):
-        own.check_type("policy", part, Policy)
+        user_code.check_type("policy", part, Policy)
 
     def apply(params: PyTree, obs: jax.Array) -> TanhGaussian:
-        distribution: TanhGaussian = own.call("policy.apply", part.apply, params, obs)
+        distribution: TanhGaussian = user_code.call("policy.apply", part.apply, params, obs)
         _check_gaussian(distribution, TanhGaussian)
         wanted = (*obs.shape[:-1], action_dim)
         _check_shape("policy.apply: mean", distribution.gaussian.mean, wanted, "the means")
         _check_shape("policy.apply: log_std", distribution.gaussian.log_std, wanted, "log-deviations of every state")
         return distribution
 
-    return SquashedPolicy(init=functools.partial(own.call, "policy.init", part.init), apply=apply)
+    return SquashedPolicy(init=functools.partial(user_code.call, "policy.init", part.init), apply=apply)
 
 
 def _check_gaussian(distribution: Any, wanted: type) -> None:
@@ -135,21 +135,21 @@ def _check_gaussian(distribution: Any, wanted: type) -> None:
 
 def critic(part: Network) -> Network:
     """`part`, checked: one value for each observation, [..., obs_dim] -> [...]."""
-    own.check_type("critic", part, Network)
+    user_code.check_type("critic", part, Network)
 
     def apply(params: PyTree, obs: jax.Array) -> jax.Array:
-        value: jax.Array = own.call("critic.apply", part.apply, params, obs)
+        value: jax.Array = user_code.call("critic.apply", part.apply, params, obs)
         _check_shape("critic.apply", value, obs.shape[:-1], "one value for each observation")
         return value
 
-    return part._replace(init=functools.partial(own.call, "critic.init", part.init), apply=apply)
+    return part._replace(init=functools.partial(user_code.call, "critic.init", part.init), apply=apply)
 
 
 def optimizer(part: Optimizer) -> Optimizer:
     """`part`, checked: it maps a learning rate to an `optax.GradientTransformation`."""
 
     def make(learning_rate: jax.Array | float) -> optax.GradientTransformation:
-        rule = own.call("optimizer", part, learning_rate)
+        rule = user_code.call("optimizer", part, learning_rate)
         if not isinstance(rule, optax.GradientTransformation):
             raise ConfigError(
                 f"optimizer: returned {type(rule).__name__}; return an optax.GradientTransformation, "

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from ccil_jax import own
+from ccil_jax import user_code
 from ccil_jax.errors import UserError
 from experiments.cli.command_line import UsageError
 
@@ -26,7 +26,7 @@ def build_environment(task: str, physics: str, options: Mapping[str, Any]) -> An
     import envs
 
     try:
-        env = own.call(f"--env {task}", functools.partial(envs.make, task, physics=physics, **options))
+        env = user_code.call(f"--env {task}", functools.partial(envs.make, task, physics=physics, **options))
     except UserError:
         raise
     except ValueError as error:
@@ -45,8 +45,8 @@ def _check_functions(task: str, env: Any) -> None:
     from ccil_jax.trees import difference
 
     action = jax.ShapeDtypeStruct((env.action_dim,), jnp.result_type(float))
-    first = own.call(f"--env {task}: reset", jax.eval_shape, env.reset, jax.random.key(0))
-    after = own.call(f"--env {task}: step", jax.eval_shape, env.step, first, action)
+    first = user_code.call(f"--env {task}: reset", jax.eval_shape, env.reset, jax.random.key(0))
+    after = user_code.call(f"--env {task}: step", jax.eval_shape, env.step, first, action)
     wanted = {"obs": (env.obs_dim,), "reward": (), "cost": (), "terminated": (), "truncated": ()}
     for where, state in (("reset", first), ("step", after)):
         if not isinstance(state, envs.State):
