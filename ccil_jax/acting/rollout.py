@@ -49,8 +49,13 @@ def act(policy_apply: PolicyApply, actor: Actor, obs: jax.Array, noise: jax.Arra
 
     Returns:
         Actions [..., action_dim], not clipped.
+
+    Raises:
+        AssertionError: the means of the policy's distribution have another shape than the noise.
     """
     distribution = policy_apply(actor.policy_params, running_statistics.normalize(actor.obs_statistics, obs))
+    gaussian = distribution.gaussian if isinstance(distribution, TanhGaussian) else distribution
+    chex.assert_equal_shape([gaussian.mean, noise], custom_message="the policy's means must be [..., action_dim]")
     return distributions.sample(distribution, noise)
 
 
