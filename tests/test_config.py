@@ -18,6 +18,7 @@ from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config, field_names, unused, validate, with_limit_of
 from ccil_jax.errors import ConfigError
 from ccil_jax.fields import Fields
+from ccil_jax.learning import constraints
 from ccil_jax.methods import METHODS
 from ccil_jax.presets import PRESETS
 from experiments import ablations, expert, sweep, train
@@ -271,13 +272,13 @@ def test_a_limit_is_resolved_once_and_never_contradicted() -> None:
 
 
 def test_the_methods_with_a_multiplier() -> None:
-    assert {name for name in METHODS if Config(method=name).has_multiplier} == {
-        "malm",
-        "ccil",
-        "lgail",
-        "pid_il",
-        "expert",
-    }
+    """The package's own, and of every row: it has one where its constraint has a state that changes."""
+    assert {"malm", "ccil", "lgail", "pid_il", "expert"} <= {n for n in METHODS if Config(method=n).has_multiplier}
+    for name, row in METHODS.items():
+        constraint = (
+            constraints.make(Config(method=name, cost_limit=1.0)) if row.constraint else constraints.Constraint()
+        )
+        assert row.has_multiplier == bool(jax.tree.leaves(constraint.init()))
     assert not Config(method="ccil", multiplier_update="optimal").has_multiplier
     assert Config(method="ccil", multiplier_update="pid").has_multiplier
 

@@ -34,6 +34,8 @@ def test_sizes_are_the_registrys(env: Any) -> None:
 def test_an_action_of_another_shape_is_refused(env: Any, shape: Any) -> None:
     shape = {"one more": (env.action_dim + 1,), "a batch": (1, env.action_dim)}.get(shape, shape)
     state = jax.eval_shape(env.reset, jax.random.key(0))
+    if shape == (env.action_dim,):
+        pytest.skip("the right shape of a task with one action")
     with pytest.raises(ValueError, match=env.name) as error:
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct(shape, np.float32))
     assert f"must have shape ({env.action_dim},), but has shape {shape}" in str(error.value)
