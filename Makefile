@@ -20,6 +20,8 @@ JOBS ?= $(or $(shell nproc 2>/dev/null),auto)
 SUITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do "$$p" -c "$(SUITS)" 2>/dev/null && echo "$$p" && break; done)
 
+# The tests of a file share what they have compiled, so they run in one process.
+SHARED := --dist loadfile
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m
 
@@ -33,7 +35,7 @@ demo: $(VENV)/.run ## set up, then train MALM on Swimmer with 3 seeds
 
 .PHONY: test
 test: lint types ## set up, then lint, check types and run the tests
-	$(RUN) pytest -n $(JOBS) --maxprocesses=8 $(PYTEST_ARGS)
+	$(RUN) pytest -n $(JOBS) --maxprocesses=8 $(SHARED) $(PYTEST_ARGS)
 
 .PHONY: test-slow
 test-slow: $(VENV)/.dev ## the tests marked slow (long compilations and trainings)
@@ -45,7 +47,7 @@ test-lowest: ## the tests with the lowest versions that pyproject.toml allows, i
 	"$(VENV)-lowest/bin/python" -m pip install --quiet --disable-pip-version-check uv
 	"$(VENV)-lowest/bin/python" -m uv pip install --python "$(VENV)-lowest/bin/python" --resolution lowest-direct \
 	  --editable ".[dev]"
-	"$(VENV)-lowest/bin/python" -m pytest -n $(JOBS) --maxprocesses=8 $(PYTEST_ARGS)
+	"$(VENV)-lowest/bin/python" -m pytest -n $(JOBS) --maxprocesses=8 $(SHARED) $(PYTEST_ARGS)
 
 .PHONY: lint
 lint: $(VENV)/.dev ## style
