@@ -14,7 +14,6 @@ import envs
 from envs.registry import TASKS
 from tests.probe_envs import Walk
 
-
 QUICK = ("Swimmer", "Ant", "PointGoal1", "CarButton1", "DoggoGoal1")  # one of each kind; the others are like them
 
 
