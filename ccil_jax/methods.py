@@ -65,11 +65,9 @@ def register_method(name: str, method: Method) -> None:
     """
     if not name.isidentifier():
         raise ConfigError(f"method {name!r}: not an identifier; use letters, digits and underscores")
-    user_code.check_type(f"method {name}", method, Method)
     if name in _methods:
         raise ConfigError(f"method {name}: is registered already; choose another name")
-    _check(name, method)
-    _methods[name] = method
+    _methods[name] = _checked(name, method)
 
 
 def find_method(name: Any) -> Method:
@@ -84,20 +82,18 @@ def find_method(name: Any) -> Method:
     if isinstance(name, str) and name in _methods:
         return _methods[name]
     if not isinstance(name, str) or ":" not in name:
-        near = hint(name, list(_methods)) if isinstance(name, str) else ""
+        near = hint(name, _methods) if isinstance(name, str) else ""
         raise ConfigError(f"--method {name!r}: unknown; {near}choose one of {', '.join(_methods)}")
     try:
         method = named_object(name)
     except ValueError as error:
         raise ConfigError(f"--method {error}") from None
-    _check(name, method)
-    row: Method = method
-    _methods[name] = row
-    return row
+    _methods[name] = _checked(name, method)
+    return _methods[name]
 
 
-def _check(name: str, method: Any) -> None:
-    """Raises `ConfigError` for parts that are unknown or do not go together.
+def _checked(name: str, method: Any) -> Method:
+    """The row. Raises `ConfigError` for parts that are unknown or do not go together.
 
     Importing the tables of functions would import JAX. Their names are known from the package's own rows, which use
     every one of them.
@@ -111,6 +107,7 @@ def _check(name: str, method: Any) -> None:
             function_of(part, names, f"--method {name}: {column}")
     if complaint := _mismatch(method):
         raise ConfigError(f"--method {name}: {complaint}")
+    return method
 
 
 def _mismatch(method: Method) -> str | None:
@@ -153,5 +150,5 @@ def function_of(part: Part, table: Mapping[str, Maker], what: str) -> Maker | Ca
     if callable(part):
         return functools.partial(user_code.call, what, part)
     if part not in table:
-        raise ConfigError(f"{what} {part!r}: unknown; {hint(part, list(table))}choose one of {', '.join(table)}")
+        raise ConfigError(f"{what} {part!r}: unknown; {hint(part, table)}choose one of {', '.join(table)}")
     return table[part]

@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 _NAME = r"[^\W\d]\w*"
@@ -63,7 +64,7 @@ def named_object(text: str) -> Any:
     try:
         return operator.attrgetter(attribute)(module)
     except AttributeError:
-        near = hint(attribute, {name.casefold(): name for name in vars(module) if not name.startswith("_")})
+        near = hint(attribute, (name for name in vars(module) if not name.startswith("_")))
         raise ValueError(
             f"{text}: module {module_name!r} has no attribute {attribute!r}; {near}define it there or correct the name"
         ) from None
@@ -74,14 +75,15 @@ def _failed(text: str, module: str, error: BaseException) -> str:
     return f"{text}: importing module {module!r} raised {type(error).__name__}: {reason}; correct that module"
 
 
-def hint(name: str, spellings: Mapping[str, str] | Iterable[str]) -> str:
+def hint(name: str, names: Iterable[str] = (), *, spellings: Mapping[str, str] = MappingProxyType({})) -> str:
     """The question "did you mean ...? ", or nothing where no known name is near.
 
     Args:
         name: what a person wrote.
-        spellings: the known names, or a mapping from each spelling in lower case to the name that it stands for. Of
-            equally near spellings the first wins.
+        names: the known names; of a mapping its keys.
+        spellings: further spellings in lower case, each with the name that it stands for. Of equally near ones the
+            first wins.
     """
-    known = spellings if isinstance(spellings, Mapping) else {spelling.casefold(): spelling for spelling in spellings}
+    known = {**{spelling.casefold(): spelling for spelling in names}, **spellings}
     near = difflib.get_close_matches(name.casefold(), known, n=1, cutoff=0.6)
     return f"did you mean {known[near[0]]}? " if near else ""

@@ -192,4 +192,4 @@ def find_task(name: Any) -> TaskInfo:
     spellings = {
         spelling.casefold(): task.name for task in _tasks.values() for spelling in (task.name, task.original or "")
     }
-    raise ValueError(f"{name}: unknown task; {hint(str(name), spellings)}choose one of {', '.join(_tasks)}")
+    raise ValueError(f"{name}: unknown task; {hint(str(name), spellings=spellings)}choose one of {', '.join(_tasks)}")

@@ -22,7 +22,7 @@ from ccil_jax.demonstrations import formats
 from ccil_jax.errors import ConfigError
 from ccil_jax.learning.constraints import CONSTRAINTS
 from ccil_jax.learning.reward_models import REWARD_MODELS
-from ccil_jax.methods import _BUILT_IN, Method, _check, _methods
+from ccil_jax.methods import _BUILT_IN, Method, _checked, _methods
 from envs import registry
 from envs.testing import check_environment
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
@@ -271,10 +271,10 @@ def test_rows_that_mean_nothing_are_refused(name: str, method: Method, message: 
 
 
 def test_the_rows_of_the_package_name_all_that_the_tables_have() -> None:
-    """The names that a row of the user's own may have are read from them; see `methods._check`."""
+    """The names that a row of the user's own may have are read from them; see `methods._checked`."""
     tables = {"agent": AGENTS, "reward": REWARD_MODELS, "constraint": CONSTRAINTS, "policy": POLICIES}
     for row in _BUILT_IN:
-        _check("built_in", row)
+        _checked("built_in", row)
     for column, table in tables.items():
         assert {getattr(row, column) for row in _BUILT_IN} - {None} == set(table)
 

@@ -71,9 +71,8 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
     ):
         display.message(f"{_announcement(program)}; compiling ...")
         xla.spread_seeds(program.num_runs)
-        from ccil_jax.agents.build import (
-            resolve,  # imports JAX, so that it has to wait until the input has been checked
-        )
+        # This imports JAX, so that it has to wait until the input has been checked.
+        from ccil_jax.agents.build import resolve
 
         env = build_environment(setup.task, setup.physics, setup.env_options)
         for run in program.runs:  # what does not fit is refused before anything is written
