@@ -115,7 +115,7 @@ def register(
         action_dim: length of an action, if it is known beforehand.
         cost_limit: default episode cost that is allowed to an expert which records demonstrations.
         cost: what costs how much in a step, in words.
-        expert_preset: key of `ccil_jax.config.PRESETS`, the hyperparameters that an expert starts from.
+        expert_preset: key of `ccil_jax.presets.PRESETS`, the hyperparameters that an expert starts from.
         original: the environment that the task is compared with.
 
     Returns:

@@ -32,7 +32,7 @@ class TaskInfo:
     max_episode_steps: int | None = MAX_EPISODE_STEPS  # the default; None: known only once the task is built
     cost_limit: float | None = None  # default episode cost allowed to the expert that records demonstrations
     cost: str = ""  # what costs how much in a step, in words
-    expert_preset: str = "expert"  # the hyperparameters that an expert starts from, a key of `ccil_jax.config.PRESETS`
+    expert_preset: str = "expert"  # the hyperparameters that an expert starts from, a key of `ccil_jax.presets.PRESETS`
     original: str | None = None  # the environment that the task is compared with
     original_package: Literal["gymnasium", "safety_gymnasium"] | None = None  # which has that environment
     # Options of that environment which make its observations those of the task.
