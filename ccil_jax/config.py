@@ -16,12 +16,15 @@ from ccil_jax.methods import Method, find_method
 from ccil_jax.presets import PRESETS
 from ccil_jax.uses import (
     ACTING,
+    ACTOR,
     ADVERSARIAL,
     ALL,
     ASCENT,
-    BC,
+    CLONED,
+    CLONING,
     CONSTRAINED,
     CVAG,
+    GAUSSIAN,
     HELD_OUT,
     IQ_LEARN,
     LAGRANGIAN,
@@ -29,7 +32,6 @@ from ccil_jax.uses import (
     MALM,
     META,
     MULTIPLIER,
-    OFF_POLICY,
     ON_POLICY,
     PENALIZED,
     PID,
@@ -37,6 +39,7 @@ from ccil_jax.uses import (
 )
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
+    "action_likelihood": ("gaussian", "censored"),
     "activation": ("tanh", "relu", "swish"),
     "meta_gradient": ("full", "direct", "indirect", "none"),
     "outer_advantage": ("stale", "re-evaluated"),
@@ -167,7 +170,21 @@ class Config:
     bootstrap_at_truncation: bool = _static(
         True, "whether the future beyond a time limit counts, with the critic's value; false takes 0 for it (authors)"
     )
-    bc_epochs: int = _static(200, "passes over the demonstrations; each is one iteration", BC)
+    action_likelihood: str = _static(
+        "gaussian",
+        "likelihood of an action: gaussian is the density of the action as it was drawn (authors), censored that of "
+        "the action as it is executed, where one at a bound of its range stands for all draws beyond it too",
+        GAUSSIAN,
+    )
+    cloning_epochs: int = _static(
+        0,
+        "passes over the demonstrations in which the policy is cloned from them before anything else is learnt; for bc "
+        "each is one iteration",
+        CLONING,
+    )
+    warmup_iterations: int = _static(
+        0, "first iterations in which the policy stays as it is, while critics and discriminator learn from it", CLONED
+    )
     replay_size: int = _static(
         200_000,
         "environment steps that the replay memory holds, the newest ones (published: 1e6, never filled here)",
@@ -215,7 +232,9 @@ class Config:
     pid_integral_gain: float = _traced(0.05, "gain of the sum of all gaps so far", PID)
     pid_derivative_gain: float = _traced(0.5, "gain of the rise of the smoothed gap, where it rises", PID)
     pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap in the new one", PID)
-    actor_learning_rate: float = _traced(1e-3, "learning rate of the policy of bc and iq_learn, Adam", OFF_POLICY)
+    actor_learning_rate: float = _traced(
+        1e-3, "learning rate of the policy of bc, iq_learn and the cloning before another method, Adam", ACTOR
+    )
     target_update_rate: float = _traced(
         0.005, "share of the critic in each update of its Polyak average, the target critic (published)", IQ_LEARN
     )
@@ -224,6 +243,9 @@ class Config:
     )
     temperature: float | None = _traced(
         None, "weight of the entropy in the soft values; none takes the task's published value", IQ_LEARN
+    )
+    cloning_weight: float = _traced(
+        0.0, "weight of the demonstrations' mean log likelihood in the policy's objective, after the cloning", CLONED
     )
     cost_limit: float | None = _traced(
         None,
@@ -280,7 +302,7 @@ class Config:
     @property
     def num_iterations(self) -> int:
         """Iterations needed to consume at least `env_steps`; passes over the demonstrations for behaviour cloning."""
-        return math.ceil(self.env_steps / self.steps_per_iteration) if self.reads("env_steps") else self.bc_epochs
+        return math.ceil(self.env_steps / self.steps_per_iteration) if self.reads("env_steps") else self.cloning_epochs
 
     @property
     def num_held_out(self) -> int:
@@ -431,8 +453,9 @@ def validate(config: Config) -> None:
 def _check_ranges(config: Config) -> None:
     """Each number by itself."""
     for name, default in _DEFAULTS.items():
-        if is_integer(default) and getattr(config, name) < 1:
-            raise ConfigError(f"--{name} {getattr(config, name)}: must be at least 1")
+        smallest = 1 if default else 0
+        if is_integer(default) and getattr(config, name) < smallest:
+            raise ConfigError(f"--{name} {getattr(config, name)}: must be at least {smallest}")
     if not config.hidden_sizes or min(config.hidden_sizes) < 1:
         raise ConfigError(f"--hidden_sizes {config.hidden_sizes}: give at least one layer of at least one unit")
     for name in field_names(traced=True):
@@ -496,5 +519,7 @@ def _check_method(config: Config) -> None:
         )
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
+    if config.row.agent == "behavior_cloning" and config.cloning_epochs == 0:
+        raise ConfigError("--cloning_epochs 0: method bc would learn nothing; give a number such as 200")
     if LIMITED.holds(config) and config.cost_limit is None:
         raise ConfigError(f"--cost_limit: method {config.method} needs a prescribed episode cost limit")

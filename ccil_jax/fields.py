@@ -34,7 +34,9 @@ class Fields(TypedDict, total=False):
     critic_minibatch_size: int
     standardize_cost_advantage: bool
     bootstrap_at_truncation: bool
-    bc_epochs: int
+    action_likelihood: str
+    cloning_epochs: int
+    warmup_iterations: int
     replay_size: int
     updates_per_step: int
     value_loss: str
@@ -62,4 +64,5 @@ class Fields(TypedDict, total=False):
     target_update_rate: float
     chi2_coefficient: float
     temperature: float | None
+    cloning_weight: float
     cost_limit: float | None

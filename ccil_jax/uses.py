@@ -69,6 +69,16 @@ MALM = Use(lambda row: row.constraint == "meta_lagrangian")
 HELD_OUT = Use(MALM.reads, "{methods} whose held_out_fraction is above 0", lambda config: config.held_out_fraction > 0)
 META = Use(MALM.reads, "{methods} unless meta_gradient is none", lambda config: config.meta_gradient != "none")
 CVAG = Use(lambda row: row.constraint == "alternating")
-BC = Use(lambda row: row.agent == "behavior_cloning")
+GAUSSIAN = Use(lambda row: row.agent in ("on_policy", "behavior_cloning"), "methods with a Gaussian policy ({methods})")
+CLONING = Use(lambda row: GAUSSIAN.reads(row) and row.imitates, "methods that can begin with a clone ({methods})")
+CLONED = Use(
+    lambda row: row.agent == "on_policy" and row.imitates,
+    "{methods} whose cloning_epochs are above 0",
+    lambda config: config.cloning_epochs > 0,
+)
 IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
-OFF_POLICY = Use(lambda row: row.agent in ("behavior_cloning", "iq_learn"))
+ACTOR = Use(
+    lambda row: row.agent == "iq_learn" or CLONING.reads(row),
+    "{methods}; an on-policy method only if its cloning_epochs are above 0",
+    lambda config: config.row.agent == "iq_learn" or config.cloning_epochs > 0,
+)

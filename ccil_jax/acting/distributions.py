@@ -1,4 +1,4 @@
-"""The policy's distribution over actions: a diagonal Gaussian, plain or squashed into the range of the actions."""
+"""The policy's distribution over actions: a diagonal Gaussian, plain, censored at the bounds, or squashed."""
 
 import math
 
@@ -17,6 +17,19 @@ class Gaussian:
 
 
 @struct.dataclass(kw_only=True)
+class CensoredGaussian:
+    """Actions as they are executed: those of a Gaussian, clipped to the range of the actions.
+
+    Inside the range an action has the Gaussian's density. At a bound it stands for every draw at the bound or beyond,
+    and has the probability of that tail (Fujita and Maeda 2018, "Clipped action policy gradient").
+    """
+
+    gaussian: Gaussian
+    low: jax.Array  # [action_dim], -inf where there is no bound
+    high: jax.Array  # [action_dim], inf where there is no bound
+
+
+@struct.dataclass(kw_only=True)
 class TanhGaussian:
     """Actions center + half_range * u, where u is tanh of a Gaussian whose standard deviation depends on the state."""
 
@@ -25,11 +38,20 @@ class TanhGaussian:
     half_range: jax.Array  # [action_dim]
 
 
-def sample(distribution: Gaussian | TanhGaussian, noise: Float[Array, "... A"]) -> Float[Array, "... A"]:
-    """The actions that standard normal `noise` maps to: mean + std * noise, squashed where the distribution is.
+def gaussian_of(distribution: Gaussian | CensoredGaussian | TanhGaussian) -> Gaussian:
+    """The Gaussian before its draws are clipped or squashed."""
+    return distribution if isinstance(distribution, Gaussian) else distribution.gaussian
+
+
+def sample(
+    distribution: Gaussian | CensoredGaussian | TanhGaussian, noise: Float[Array, "... A"]
+) -> Float[Array, "... A"]:
+    """The actions that standard normal `noise` maps to: mean + std * noise, clipped or squashed as the distribution is.
 
     Zero noise gives the mode (that of the Gaussian before it is squashed).
     """
+    if isinstance(distribution, CensoredGaussian):
+        return jnp.clip(sample(distribution.gaussian, noise), distribution.low, distribution.high)
     if isinstance(distribution, TanhGaussian):
         unit = jnp.tanh(sample(distribution.gaussian, noise))
         return _wide(distribution.center, unit) + _wide(distribution.half_range, unit) * unit
@@ -50,23 +72,47 @@ def sample_unit(
     return jnp.tanh(raw), jnp.sum(density, axis=-1)
 
 
-def log_prob(distribution: Gaussian, action: Float[Array, "... A"]) -> Float[Array, "..."]:
-    """Log density of `action`, nats, summed over the entries of the action."""
+def log_prob(distribution: Gaussian | CensoredGaussian, action: Float[Array, "... A"]) -> Float[Array, "..."]:
+    """Log likelihood of `action`, nats, summed over its entries; an action beyond a bound counts as one at the bound.
+
+    It is the log density, and for an entry at a bound of a `CensoredGaussian` log Phi of the tail,
+
+        log Phi((low - mean) / std)  and  log Phi((mean - high) / std).
+    """
+    if isinstance(distribution, CensoredGaussian):
+        return _censored_log_prob(distribution, action)
     standardized = (action - distribution.mean) * _wide(jnp.exp(-distribution.log_std), action)
     return -0.5 * jnp.sum(standardized**2 + math.log(2 * math.pi), axis=-1) - jnp.sum(distribution.log_std)
 
 
-def kl_divergence(old: Gaussian, new: Gaussian) -> Float[Array, "..."]:
-    """The Kullback-Leibler divergence KL(old || new), nats, summed over the entries of the action."""
+def _censored_log_prob(distribution: CensoredGaussian, action: jax.Array) -> jax.Array:
+    mean, log_std = distribution.gaussian.mean, _wide(distribution.gaussian.log_std, action)
+    low, high = _wide(distribution.low, action), _wide(distribution.high, action)
+    at_bound = (action <= low) | (action >= high)
+    beyond = jnp.where(action <= low, low - mean, mean - high)  # from the mean to the bound, positive if it is beyond
+    standardized = jnp.where(at_bound, beyond, action - mean) * jnp.exp(-log_std)
+    density = -0.5 * (standardized**2 + math.log(2 * math.pi)) - log_std
+    # 0 where it is not needed: there a bound may be infinite, and infinity times a derivative of 0 is NaN.
+    tail = jax.scipy.special.log_ndtr(jnp.where(at_bound, standardized, 0.0))
+    return jnp.sum(jnp.where(at_bound, tail, density), axis=-1)
+
+
+def kl_divergence(old: Gaussian | CensoredGaussian, new: Gaussian | CensoredGaussian) -> Float[Array, "..."]:
+    """The Kullback-Leibler divergence KL(old || new), nats, summed over the entries of the action.
+
+    That of the Gaussians. Clipping both alike can only lower it (data processing inequality), so for censored ones it
+    is an upper bound.
+    """
+    old, new = gaussian_of(old), gaussian_of(new)
     variance_ratio = jnp.exp(2 * (old.log_std - new.log_std))
     shift = (old.mean - new.mean) * _wide(jnp.exp(-new.log_std), new.mean)
     spread = _wide(new.log_std - old.log_std, shift)
     return jnp.sum(spread + 0.5 * (_wide(variance_ratio, shift) + shift**2 - 1), axis=-1)
 
 
-def entropy(distribution: Gaussian) -> Float[Array, ""]:
-    """Differential entropy, nats. It is the same in every state, as the standard deviations are."""
-    return jnp.sum(distribution.log_std + 0.5 * math.log(2 * math.pi * math.e))
+def entropy(distribution: Gaussian | CensoredGaussian) -> Float[Array, ""]:
+    """Differential entropy of the Gaussian, nats. It is the same in every state, as the standard deviations are."""
+    return jnp.sum(gaussian_of(distribution).log_std + 0.5 * math.log(2 * math.pi * math.e))
 
 
 def fisher_product(distribution: Gaussian, tangent: Gaussian) -> Gaussian:

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ccil_jax.acting.distributions import Gaussian, TanhGaussian
+from ccil_jax.acting import distributions
+from ccil_jax.acting.distributions import CensoredGaussian, Gaussian, TanhGaussian
 from ccil_jax.config import Config
 from ccil_jax.methods import function_of
 from ccil_jax.types import PyTree
@@ -48,10 +49,10 @@ class Network(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """`init(key) -> params`; `apply(params, normalized_obs) -> Gaussian`."""
+    """`init(key) -> params`; `apply(params, normalized_obs) -> Gaussian`, or what `censored` makes of it."""
 
     init: Callable[[jax.Array], PyTree]
-    apply: Callable[[PyTree, jax.Array], Gaussian]
+    apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian]
 
 
 class SquashedPolicy(NamedTuple):
@@ -81,6 +82,17 @@ def make_policy(config: Config, obs_dim: int, action_dim: int, initial_std: jax.
         return Gaussian(mean=mean, log_std=params["log_std"])
 
     return Policy(init, apply)
+
+
+def censored(policy: Policy, env: Environment) -> Policy:
+    """The policy whose actions are clipped to the environment's range when they are drawn, as they are executed."""
+    low, high = (jnp.asarray(bound, jnp.result_type(float)) for bound in (env.action_low, env.action_high))
+
+    def apply(params: PyTree, obs: Float[Array, "... D"]) -> CensoredGaussian:
+        gaussian = distributions.gaussian_of(policy.apply(params, obs))
+        return CensoredGaussian(gaussian=gaussian, low=low, high=high)
+
+    return Policy(policy.init, apply)
 
 
 LOG_STD_RANGE = (-5.0, 2.0)  # of a squashed policy (the published code of IQ-Learn, after pytorch_sac)

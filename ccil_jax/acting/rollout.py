@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 
 from ccil_jax.acting import distributions, running_statistics
-from ccil_jax.acting.distributions import Gaussian, TanhGaussian
+from ccil_jax.acting.distributions import CensoredGaussian, Gaussian, TanhGaussian
 from ccil_jax.acting.running_statistics import RunningStatistics
 from ccil_jax.types import PyTree, Transition
 from envs.base import Environment, State
@@ -34,7 +34,7 @@ class RolloutState:
     whole: jax.Array  # [N] bool: false while a first episode lasts that was shortened, see `init`
 
 
-PolicyApply = Callable[[PyTree, jax.Array], Gaussian] | Callable[[PyTree, jax.Array], TanhGaussian]
+PolicyApply = Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian | TanhGaussian]
 
 
 @full_precision
@@ -48,14 +48,14 @@ def act(policy_apply: PolicyApply, actor: Actor, obs: jax.Array, noise: jax.Arra
         noise: [..., action_dim].
 
     Returns:
-        Actions [..., action_dim], not clipped.
+        Actions [..., action_dim]; not clipped unless the distribution is a `CensoredGaussian`.
 
     Raises:
         AssertionError: the means of the policy's distribution have another shape than the noise.
     """
     distribution = policy_apply(actor.policy_params, running_statistics.normalize(actor.obs_statistics, obs))
-    gaussian = distribution.gaussian if isinstance(distribution, TanhGaussian) else distribution
-    chex.assert_equal_shape([gaussian.mean, noise], custom_message="the policy's means must be [..., action_dim]")
+    mean = distributions.gaussian_of(distribution).mean
+    chex.assert_equal_shape([mean, noise], custom_message="the policy's means must be [..., action_dim]")
     return distributions.sample(distribution, noise)
 
 

@@ -8,7 +8,7 @@ import optax
 from flax import struct
 
 from ccil_jax.acting import distributions, networks, running_statistics
-from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
 from ccil_jax.acting.networks import Policy
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents import contracts
@@ -34,7 +34,7 @@ class AgentState:
 
 
 def negative_log_likelihood(
-    apply: Callable[[PyTree, jax.Array], Gaussian], params: PyTree, obs: jax.Array, action: jax.Array
+    apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian], params: PyTree, obs: jax.Array, action: jax.Array
 ) -> jax.Array:
     """Mean over the samples [M], nats."""
     return -jnp.mean(distributions.log_prob(apply(params, obs), action))
@@ -58,6 +58,8 @@ def make(
     """Builds the agent; an iteration is one pass over the demonstrations."""
     assert expert is not None, "bc learns from demonstrations"
     policy = contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim)
+    if config.action_likelihood == "censored":
+        policy = networks.censored(policy, env)
     apply, rule = policy.apply, optimizer(config.actor_learning_rate)
     statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
     obs = running_statistics.normalize(statistics, expert.obs)

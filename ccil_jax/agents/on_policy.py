@@ -15,7 +15,7 @@ from flax import struct
 from ccil_jax.acting import distributions, networks, rollout, running_statistics
 from ccil_jax.acting.networks import Network, Policy
 from ccil_jax.acting.rollout import Actor, RolloutState
-from ccil_jax.agents import contracts
+from ccil_jax.agents import behavior_cloning, contracts
 from ccil_jax.agents.base import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
 from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step, regression, reward_models
@@ -66,6 +66,8 @@ class Parts(NamedTuple):
     reward_model: RewardModel
     constraint: Constraint
     optimizer: Optimizer  # of the critics
+    expert: ExpertData | None = None
+    clone: Agent | None = None  # learns the first policy from the demonstrations, one pass a step
 
     @property
     def limit(self) -> jax.Array:
@@ -86,16 +88,25 @@ def make_parts(
     optimizer: Optimizer = adam,
 ) -> Parts:
     """The parts of the agent of `config.method`; what is given takes the place of the method's own."""
+    own = networks.policy_of(config, env) if policy is None else policy
+    policy = contracts.policy(own, env.action_dim)
+    clone = None
+    if config.reads("cloning_epochs") and config.cloning_epochs:
+        clone = behavior_cloning.make(config, env, expert, policy=own)
+    if config.action_likelihood == "censored":
+        policy = networks.censored(policy, env)
     return Parts(
         config=config,
         env=env,
-        policy=contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim),
+        policy=policy,
         critic=contracts.critic(networks.make_scalar(config, env.obs_dim) if critic is None else critic),
         reward_model=contracts.reward_model(
             reward_models.make(config, env, expert, optimizer) if reward_model is None else reward_model
         ),
         constraint=contracts.constraint(constraints.make(config) if constraint is None else constraint),
         optimizer=optimizer,
+        expert=expert,
+        clone=clone,
     )
 
 
@@ -120,7 +131,7 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
     init_critic = functools.partial(regression.init, optimizer=parts.optimizer)
     zero = jnp.zeros(())
     return AgentState(
-        actor=Actor(policy_params=parts.policy.init(policy_key), obs_statistics=running_statistics.init(env.obs_dim)),
+        actor=first_actor(parts, policy_key),
         critics=jax.vmap(init_critic, in_axes=(0, None))(critic_params, config.critic_learning_rate),
         reward_model=parts.reward_model.init(reward_key),
         constraint=parts.constraint.init(),
@@ -130,6 +141,15 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
         iteration=jnp.zeros((), jnp.int32),
         key=key,
     )
+
+
+def first_actor(parts: Parts, key: jax.Array) -> Actor:
+    """The policy before the first iteration: cloned from the demonstrations where the configuration says so."""
+    if parts.clone is None:
+        return Actor(policy_params=parts.policy.init(key), obs_statistics=running_statistics.init(parts.env.obs_dim))
+    clone = parts.clone
+    state, _ = scan(lambda state, _: clone.step(state), clone.init(key), jnp.arange(parts.config.cloning_epochs))
+    return state.actor
 
 
 def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
@@ -182,6 +202,7 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
     """One batch and what is learnt from it: policy and critics (Algorithm 1 lines 4 to 12)."""
     config, policy, constraint = parts.config, parts.policy, parts.constraint
     rollout_key, split_key, critic_key = jax.random.split(key, 3)
+    anchor_key = jax.random.fold_in(key, 3)
     rollout_state, transition = rollout.rollout(
         parts.env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
     )
@@ -194,12 +215,25 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
     order = policy_step.random_order(config, split_key)
     held_out, training = policy_step.split(samples, config.num_held_out, order)
     params, taken, step_metrics = policy_step.improve(
-        config, policy.apply, constraint, state.actor.policy_params, training, multiplier, step_gap, held_out
+        config,
+        policy.apply,
+        constraint,
+        state.actor.policy_params,
+        training,
+        multiplier,
+        step_gap,
+        held_out,
+        anchor=anchor(parts, state, anchor_key),
     )
+    if parts.clone is not None:
+        warm = state.iteration < config.warmup_iterations
+        params = jax.tree.map(lambda old, new: jnp.where(warm, old, new), state.actor.policy_params, params)
     critics, critic_losses = fit_critics(parts, state.critics, training, critic_key)
 
     assert state.actor.obs_statistics is not None
-    statistics = running_statistics.update(state.actor.obs_statistics, transition.obs)
+    statistics = state.actor.obs_statistics
+    if parts.clone is None:
+        statistics = running_statistics.update(statistics, transition.obs)
     metrics = step_metrics | {
         "episodes_finished": finished,
         "imitation_reward": mean_reward,
@@ -215,6 +249,16 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
         estimates=estimates,
     )
     return new, LastBatch(transition=transition, taken=taken, order=order), metrics
+
+
+def anchor(parts: Parts, state: AgentState, key: jax.Array) -> tuple[jax.Array, jax.Array] | None:
+    """As many of the demonstrations' steps as the policy step has samples, drawn at random: obs, action."""
+    if parts.clone is None:
+        return None
+    assert parts.expert is not None
+    indices = jax.random.randint(key, (parts.config.num_training,), 0, len(parts.expert.obs))
+    obs = running_statistics.normalize(state.actor.obs_statistics, parts.expert.obs[indices])
+    return obs, parts.expert.action[indices]
 
 
 def update_constraint(parts: Parts, state: AgentState, reward_state: PyTree, last: LastBatch) -> tuple[PyTree, Metrics]:

@@ -11,7 +11,7 @@ from flax import struct
 from jax.flatten_util import ravel_pytree
 
 from ccil_jax.acting import distributions
-from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
 from ccil_jax.config import Config
 from ccil_jax.learning import trust_region
 from ccil_jax.learning.constraints import Constraint, Outer
@@ -57,13 +57,14 @@ def importance(log_prob: jax.Array, old_log_prob: jax.Array) -> jax.Array:
 
 def improve(
     config: Config,
-    policy_apply: Callable[[PyTree, jax.Array], Gaussian],
+    policy_apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian],
     constraint: Constraint,
     policy_params: PyTree,
     batch: Batch,
     multiplier: jax.Array,
     step_gap: jax.Array,
     held_out: Batch,
+    anchor: tuple[jax.Array, jax.Array] | None = None,
 ) -> tuple[PyTree, PolicyStep, Metrics]:
     """The policy step on the training samples (Algorithm 1 line 10, Algorithm 2 lines 8 to 11)."""
     params, unravel = ravel_pytree(policy_params)
@@ -76,7 +77,10 @@ def improve(
         bonus = config.policy_entropy_coefficient * distributions.entropy(new)
         reward = jnp.mean(weights * batch.reward_advantage) + bonus
         cost = jnp.mean(weights * batch.cost_advantage) - bonus * float(constraint.entropy_in_cost)
-        return jnp.stack([reward, cost]), jnp.mean(distributions.kl_divergence(old, new))
+        found = [reward, cost]
+        if anchor is not None:
+            found.append(jnp.mean(distributions.log_prob(policy_apply(unravel(params), anchor[0]), anchor[1])))
+        return jnp.stack(found), jnp.mean(distributions.kl_divergence(old, new))
 
     gradients = jax.jacrev(lambda params: objectives(params)[0])(params)
     fisher_obs = batch.obs[:: config.fisher_stride]
@@ -84,7 +88,7 @@ def improve(
         lambda params: policy_apply(unravel(params), fisher_obs), params, config.cg_damping
     )
     directions = trust_region.directions(product, gradients, config.cg_iterations)
-    weights = constraint.combine(multiplier, step_gap, directions.gram)
+    weights = _weights(config, constraint, multiplier, step_gap, directions.gram)
     new_params, fraction, metrics = trust_region.step(
         params,
         directions,
@@ -103,8 +107,19 @@ def improve(
     return unravel(new_params), taken, metrics | {"cost_weight": -weights[1]}
 
 
+def _weights(
+    config: Config, constraint: Constraint, multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array
+) -> jax.Array:
+    """Of the objectives in the step: the constraint's for reward and cost, and that of the demonstrations, if any."""
+    weights = constraint.combine(multiplier, step_gap, gram[:2, :2])
+    return weights if len(gram) == 2 else jnp.append(weights, config.cloning_weight)
+
+
 def outer_problem(
-    config: Config, policy_apply: Callable[[PyTree, jax.Array], Gaussian], constraint: Constraint, taken: PolicyStep
+    config: Config,
+    policy_apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian],
+    constraint: Constraint,
+    taken: PolicyStep,
 ) -> Outer:
     """The held-out samples, with the importance weights that the step would have had under another multiplier."""
     held_out = taken.held_out
@@ -114,7 +129,7 @@ def outer_problem(
         return distributions.log_prob(policy_apply(unravel(params), held_out.obs), held_out.action)
 
     def importance_weights(multiplier: jax.Array) -> jax.Array:
-        weights = constraint.combine(multiplier, taken.step_gap, taken.directions.gram)
+        weights = _weights(config, constraint, multiplier, taken.step_gap, taken.directions.gram)
         new_params = trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
         return importance(log_prob(new_params), log_prob(old_params))
 

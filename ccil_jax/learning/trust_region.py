@@ -16,7 +16,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ccil_jax.acting import distributions
-from ccil_jax.acting.distributions import Gaussian
+from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
 from ccil_jax.types import Metrics
 
 Vectors = Float[Array, "R P"]
@@ -31,7 +31,9 @@ class Directions:
 
 
 def fisher_vector_product(
-    distribution: Callable[[jax.Array], Gaussian], params: Float[Array, " P"], damping: Float[Array, ""] | float
+    distribution: Callable[[jax.Array], Gaussian | CensoredGaussian],
+    params: Float[Array, " P"],
+    damping: Float[Array, ""] | float,
 ) -> Callable[[Vectors], Vectors]:
     """The function that multiplies each of R vectors by F + damping I.
 
@@ -39,7 +41,7 @@ def fisher_vector_product(
     form J^T M J: J is the Jacobian of (mean, log_std) and M the Fisher matrix in these coordinates. J is found once, by
     linearisation, and used by every product.
     """
-    at, push = jax.linearize(distribution, params)
+    at, push = jax.linearize(lambda params: distributions.gaussian_of(distribution(params)), params)
     pull = jax.linear_transpose(push, params)
     num_samples = at.mean.shape[0]
 
