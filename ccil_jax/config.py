@@ -176,7 +176,7 @@ class Config:
         "the action as it is executed, where one at a bound of its range stands for all draws beyond it too",
         GAUSSIAN,
     )
-    cloning_epochs: int = _static(
+    cloning_updates: int = _static(
         0,
         "passes over the demonstrations in which the policy is cloned from them before anything else is learnt; for bc "
         "each is one iteration",
@@ -302,7 +302,11 @@ class Config:
     @property
     def num_iterations(self) -> int:
         """Iterations needed to consume at least `env_steps`; passes over the demonstrations for behaviour cloning."""
-        return math.ceil(self.env_steps / self.steps_per_iteration) if self.reads("env_steps") else self.cloning_epochs
+        return (
+            math.ceil(self.env_steps / self.steps_per_iteration)
+            if self.reads("env_steps")
+            else -(-self.cloning_updates // 100)
+        )
 
     @property
     def num_held_out(self) -> int:
@@ -519,7 +523,7 @@ def _check_method(config: Config) -> None:
         )
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
-    if config.row.agent == "behavior_cloning" and config.cloning_epochs == 0:
-        raise ConfigError("--cloning_epochs 0: method bc would learn nothing; give a number such as 200")
+    if config.row.agent == "behavior_cloning" and config.cloning_updates == 0:
+        raise ConfigError("--cloning_updates 0: method bc would learn nothing; give a number such as 200")
     if LIMITED.holds(config) and config.cost_limit is None:
         raise ConfigError(f"--cost_limit: method {config.method} needs a prescribed episode cost limit")

@@ -35,7 +35,7 @@ class Fields(TypedDict, total=False):
     standardize_cost_advantage: bool
     bootstrap_at_truncation: bool
     action_likelihood: str
-    cloning_epochs: int
+    cloning_updates: int
     warmup_iterations: int
     replay_size: int
     updates_per_step: int

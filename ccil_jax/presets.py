@@ -57,7 +57,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "multiplier_update": "sgd",
         "multiplier_learning_rate": 7e-4,
     },
-    "bc": {"method": "bc", "cloning_epochs": 200},
+    "bc": {"method": "bc", "cloning_updates": 20_000},
     # As published, except for the length: 60,000 steps with as many updates were enough on HalfCheetah.
     "iq_learn": {
         "method": "iq_learn",

@@ -73,12 +73,12 @@ GAUSSIAN = Use(lambda row: row.agent in ("on_policy", "behavior_cloning"), "meth
 CLONING = Use(lambda row: GAUSSIAN.reads(row) and row.imitates, "methods that can begin with a clone ({methods})")
 CLONED = Use(
     lambda row: row.agent == "on_policy" and row.imitates,
-    "{methods} whose cloning_epochs are above 0",
-    lambda config: config.cloning_epochs > 0,
+    "{methods} whose cloning_updates are above 0",
+    lambda config: config.cloning_updates > 0,
 )
 IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
 ACTOR = Use(
     lambda row: row.agent == "iq_learn" or CLONING.reads(row),
-    "{methods}; an on-policy method only if its cloning_epochs are above 0",
-    lambda config: config.row.agent == "iq_learn" or config.cloning_epochs > 0,
+    "{methods}; an on-policy method only if its cloning_updates are above 0",
+    lambda config: config.row.agent == "iq_learn" or config.cloning_updates > 0,
 )

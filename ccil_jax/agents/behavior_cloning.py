@@ -14,11 +14,11 @@ from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents import contracts
 from ccil_jax.agents.base import Agent
 from ccil_jax.config import Config
-from ccil_jax.learning.minibatches import minibatches
 from ccil_jax.learning.optimizers import Optimizer, adam
 from ccil_jax.types import ExpertData, Metrics, PyTree
 from envs.base import Environment
 
+UPDATES_PER_ITERATION = 100
 SMALLEST_LOG_STD = -4.0  # the likelihood of an action that the expert never varies has no maximum
 
 
@@ -89,7 +89,7 @@ def make(
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, shuffle_key = jax.random.split(state.key)
-        order = minibatches(shuffle_key, obs.shape[0], minibatch_size=minibatch_size, num_epochs=1)
+        order = jax.random.randint(shuffle_key, (UPDATES_PER_ITERATION, minibatch_size), 0, obs.shape[0])
         (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), order)
         held_out = negative_log_likelihood(apply, params, held_out_obs, expert.held_out_action)
         better = held_out < state.held_out_loss

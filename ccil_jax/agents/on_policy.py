@@ -91,7 +91,7 @@ def make_parts(
     own = networks.policy_of(config, env) if policy is None else policy
     policy = contracts.policy(own, env.action_dim)
     clone = None
-    if config.reads("cloning_epochs") and config.cloning_epochs:
+    if config.reads("cloning_updates") and config.cloning_updates:
         clone = behavior_cloning.make(config, env, expert, policy=own)
     if config.action_likelihood == "censored":
         policy = networks.censored(policy, env)
@@ -148,7 +148,11 @@ def first_actor(parts: Parts, key: jax.Array) -> Actor:
     if parts.clone is None:
         return Actor(policy_params=parts.policy.init(key), obs_statistics=running_statistics.init(parts.env.obs_dim))
     clone = parts.clone
-    state, _ = scan(lambda state, _: clone.step(state), clone.init(key), jnp.arange(parts.config.cloning_epochs))
+    state, _ = scan(
+        lambda state, _: clone.step(state),
+        clone.init(key),
+        jnp.arange(-(-parts.config.cloning_updates // behavior_cloning.UPDATES_PER_ITERATION)),
+    )
     return state.actor
 
 
