@@ -28,6 +28,7 @@ from ccil_jax.uses import (
     HELD_OUT,
     IQ_LEARN,
     LAGRANGIAN,
+    LAGRANGIAN_LOSS,
     LIMITED,
     MALM,
     META,
@@ -35,6 +36,7 @@ from ccil_jax.uses import (
     ON_POLICY,
     PENALIZED,
     PID,
+    SGD,
     Use,
 )
 
@@ -42,9 +44,11 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "action_likelihood": ("gaussian", "censored"),
     "activation": ("tanh", "relu", "swish"),
     "meta_gradient": ("full", "direct", "indirect", "none"),
+    "outer_loss": ("squared", "lagrangian"),
     "outer_advantage": ("stale", "re-evaluated"),
     "held_out_unit": ("transition", "trajectory"),
     "multiplier_update": ("adam", "sgd", "pid", "optimal"),
+    "gap_unit": ("cost", "limit"),
     "meta_update": ("adam", "sgd"),
     "gate": ("batch", "episode"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
@@ -103,6 +107,12 @@ class Config:
         "indirect is the part through the policy step, none leaves the outer step out",
         MALM,
     )
+    outer_loss: str = _static(
+        "squared",
+        "what the outer step lowers on held-out samples: squared is mean (w A_r - lambda d)^2 (Algorithm 1 line 16), "
+        "lagrangian the negative Lagrangian of the policy after the step, with the gap's penalty in the cost's weight",
+        META,
+    )
     outer_advantage: str = _static(
         "stale",
         "advantages in the outer loss: stale are those that the policy step used (authors), re-evaluated are "
@@ -123,6 +133,12 @@ class Config:
         "policy "
         "step (constrained policy optimisation)",
         LAGRANGIAN,
+    )
+    gap_unit: str = _static(
+        "cost",
+        "unit of the gap that dual ascent by sgd follows: the cost's own (Algorithm 1), or the limit, so that one "
+        "learning rate suits tasks of any cost",
+        SGD,
     )
     meta_update: str = _static(
         "adam",
@@ -227,6 +243,9 @@ class Config:
     initial_multiplier: float = _traced(0.01, "lambda before the first iteration (Table 1)", MULTIPLIER)
     multiplier_learning_rate: float = _traced(0.05, "step size of the dual step (Table 1)", ASCENT)
     meta_learning_rate: float = _traced(0.05, "step size of the outer step (Table 1)", META)
+    outer_penalty: float = _traced(
+        1.0, "rho: by how much the relative gap raises the cost's weight in the lagrangian outer loss", LAGRANGIAN_LOSS
+    )
     multiplier_max: float = _traced(100.0, "largest value of the multiplier", MULTIPLIER)
     pid_proportional_gain: float = _traced(0.5, "gain of the smoothed cost gap e = (J - limit) / limit", PID)
     pid_integral_gain: float = _traced(0.05, "gain of the sum of all gaps so far", PID)
@@ -515,6 +534,11 @@ def _check_method(config: Config) -> None:
         raise ConfigError(
             "--standardize_cost_advantage true: the optimal multiplier compares the cost's surrogate with its gap, so "
             "it must keep its unit; leave it out"
+        )
+    if LAGRANGIAN_LOSS.holds(config) and config.meta_gradient == "direct":
+        raise ConfigError(
+            "--meta-gradient direct: the lagrangian outer loss depends on the multiplier through the policy alone; use "
+            "full"
         )
     if META.holds(config) and config.num_held_out == 0:
         raise ConfigError(

@@ -20,9 +20,11 @@ class Fields(TypedDict, total=False):
     hidden_sizes: tuple[int, ...]
     activation: str
     meta_gradient: str
+    outer_loss: str
     outer_advantage: str
     held_out_unit: str
     multiplier_update: str
+    gap_unit: str
     meta_update: str
     gate: str
     reward_form: str
@@ -55,6 +57,7 @@ class Fields(TypedDict, total=False):
     initial_multiplier: float
     multiplier_learning_rate: float
     meta_learning_rate: float
+    outer_penalty: float
     multiplier_max: float
     pid_proportional_gain: float
     pid_integral_gain: float

@@ -55,6 +55,9 @@ ASCENT = Use(
     "{methods} whose multiplier_update is adam or sgd",
     lambda config: config.multiplier_update in ("adam", "sgd"),
 )
+SGD = Use(
+    LAGRANGIAN.reads, "{methods} whose multiplier_update is sgd", lambda config: config.multiplier_update == "sgd"
+)
 PID = Use(
     lambda row: row.constraint in ("lagrangian", "meta_lagrangian", "pid"),
     "{methods} with a pid controller: where multiplier_update is an option, if it is pid",
@@ -68,6 +71,11 @@ MULTIPLIER = Use(
 MALM = Use(lambda row: row.constraint == "meta_lagrangian")
 HELD_OUT = Use(MALM.reads, "{methods} whose held_out_fraction is above 0", lambda config: config.held_out_fraction > 0)
 META = Use(MALM.reads, "{methods} unless meta_gradient is none", lambda config: config.meta_gradient != "none")
+LAGRANGIAN_LOSS = Use(
+    MALM.reads,
+    "{methods} whose outer_loss is lagrangian",
+    lambda config: META.holds(config) and config.outer_loss == "lagrangian",
+)
 CVAG = Use(lambda row: row.constraint == "alternating")
 GAUSSIAN = Use(lambda row: row.agent in ("on_policy", "behavior_cloning"), "methods with a Gaussian policy ({methods})")
 CLONING = Use(lambda row: GAUSSIAN.reads(row) and row.imitates, "methods that can begin with a clone ({methods})")

@@ -39,6 +39,7 @@ class Outer:
     """The outer (validation) loss of MALM on V held-out samples."""
 
     reward_advantage: jax.Array  # [V]
+    cost_advantage: jax.Array  # [V]
     cost: jax.Array  # [V]
     importance_weights: Callable[[jax.Array], jax.Array] = struct.field(
         pytree_node=False
@@ -130,7 +131,7 @@ def pid(config: Config) -> Constraint:
         derivative=config.pid_derivative_gain,
         smoothing=config.pid_smoothing,
     )
-    scale = jnp.maximum(jnp.asarray(config.cost_limit, jnp.result_type(float)), 1.0)
+    scale = limit_unit(config)
     return Constraint(
         init=lambda: pid_init(config.initial_multiplier),
         multiplier=lambda state: state.multiplier,
@@ -154,11 +155,47 @@ def meta_lagrangian(config: Config) -> Constraint:
     def update(state: Multiplier, cost_gap: jax.Array, outer: Outer | None) -> tuple[Multiplier, Metrics]:
         assert outer is not None, "the meta-gradient needs held-out samples"
         after_dual = multiplier.dual(state, cost_gap)
-        gradient = outer_gradient(config.meta_gradient, multiplier.read(state), multiplier.read(after_dual), outer)
+        before, after = multiplier.read(state), multiplier.read(after_dual)
+        if config.outer_loss == "lagrangian":
+            weight = jnp.maximum(after + config.outer_penalty * cost_gap / limit_unit(config), 0.0)
+            gradient = lagrangian_gradient(before, weight, outer)
+        else:
+            gradient = outer_gradient(config.meta_gradient, before, after, outer)
         gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
         return multiplier.outer(after_dual, gradient), {"meta_gradient": gradient}
 
     return inner._replace(update=update)
+
+
+def limit_unit(config: Config) -> jax.Array:
+    """[] what a cost gap is divided by to be relative to the limit; at least 1, since a limit may be 0."""
+    return jnp.maximum(jnp.asarray(config.cost_limit, jnp.result_type(float)), 1.0)
+
+
+def lagrangian_loss(
+    importance_weights: Float[Array, " V"],
+    reward_advantage: Float[Array, " V"],
+    cost_advantage: Float[Array, " V"],
+    weight: Float[Array, ""],
+) -> Float[Array, ""]:
+    """L = -mean w (A_r - weight A_c): what the policy step should have raised, on samples that it did not see."""
+    return -jnp.mean(importance_weights * (reward_advantage - weight * cost_advantage))
+
+
+def lagrangian_gradient(multiplier: Float[Array, ""], weight: Float[Array, ""], outer: Outer) -> Float[Array, ""]:
+    """dL/dlambda of `lagrangian_loss` through the inner policy step theta'(lambda), by forward mode.
+
+    `weight` is that of the augmented Lagrangian (Hestenes 1969, Powell 1969), max(0, lambda' + rho e) with the relative
+    gap e = (J_k - J_E) / J_E. A step along x_r - lambda x_c changes with lambda along -x_c, so on the samples of the
+    step itself the gradient is proportional to lambda - weight: descent takes lambda to a value that weighs the cost as
+    the gap demands. Where no step changes the cost, the gradient is 0 and lambda stays.
+    """
+
+    def loss(multiplier: jax.Array) -> jax.Array:
+        weights = outer.importance_weights(multiplier)
+        return lagrangian_loss(weights, outer.reward_advantage, outer.cost_advantage, weight)
+
+    return jax.jvp(loss, (multiplier,), (jnp.ones_like(multiplier),))[1]
 
 
 def outer_loss(
@@ -269,7 +306,8 @@ def ascent(config: Config) -> Ascent:
 
     def dual(state: Multiplier, cost_gap: jax.Array) -> Multiplier:
         if config.multiplier_update == "sgd":
-            return moved(state, write(read(state) + config.multiplier_learning_rate * cost_gap))
+            gap = cost_gap / limit_unit(config) if config.gap_unit == "limit" else cost_gap
+            return moved(state, write(read(state) + config.multiplier_learning_rate * gap))
         updates, optimizer_state = optimizer.update(-cost_gap, state.optimizer)
         return moved(state, state.parameter + jnp.asarray(updates), optimizer=optimizer_state)
 

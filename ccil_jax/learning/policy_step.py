@@ -110,9 +110,12 @@ def improve(
 def _weights(
     config: Config, constraint: Constraint, multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array
 ) -> jax.Array:
-    """Of the objectives in the step: the constraint's for reward and cost, and that of the demonstrations, if any."""
+    """Of the objectives in the step: the constraint's for reward and cost, and that of the demonstrations, if any.
+
+    The demonstrations keep their share of the step, however large the multiplier is.
+    """
     weights = constraint.combine(multiplier, step_gap, gram[:2, :2])
-    return weights if len(gram) == 2 else jnp.append(weights, config.cloning_weight)
+    return weights if len(gram) == 2 else jnp.append(weights, config.cloning_weight * jnp.sum(jnp.abs(weights)))
 
 
 def outer_problem(
@@ -133,4 +136,9 @@ def outer_problem(
         new_params = trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
         return importance(log_prob(new_params), log_prob(old_params))
 
-    return Outer(reward_advantage=held_out.reward_advantage, cost=held_out.cost, importance_weights=importance_weights)
+    return Outer(
+        reward_advantage=held_out.reward_advantage,
+        cost_advantage=held_out.cost_advantage,
+        cost=held_out.cost,
+        importance_weights=importance_weights,
+    )
