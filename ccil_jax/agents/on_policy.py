@@ -205,8 +205,7 @@ def generator_steps(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Ag
 def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
     """One batch and what is learnt from it: policy and critics (Algorithm 1 lines 4 to 12)."""
     config, policy, constraint = parts.config, parts.policy, parts.constraint
-    rollout_key, split_key, critic_key = jax.random.split(key, 3)
-    anchor_key = jax.random.fold_in(key, 3)
+    rollout_key, split_key, critic_key, anchor_key = jax.random.split(key, 4)
     rollout_state, transition = rollout.rollout(
         parts.env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
     )
@@ -230,8 +229,8 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
         anchor=anchor(parts, state, anchor_key),
     )
     if parts.clone is not None:
-        warm = state.iteration < config.warmup_iterations
-        params = jax.tree.map(lambda old, new: jnp.where(warm, old, new), state.actor.policy_params, params)
+        warming_up = state.iteration < config.warmup_iterations
+        params, taken, step_metrics = policy_step.unless(warming_up, params, taken, step_metrics)
     critics, critic_losses = fit_critics(parts, state.critics, training, critic_key)
 
     assert state.actor.obs_statistics is not None

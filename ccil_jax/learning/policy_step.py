@@ -3,6 +3,7 @@
 It joins `trust_region`, which takes gradients of any objectives, with `constraints`, which choose their weights.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -105,6 +106,15 @@ def improve(
         policy_params=policy_params, directions=replayed, fraction=fraction, step_gap=step_gap, held_out=held_out
     )
     return unravel(new_params), taken, metrics | {"cost_weight": -weights[1]}
+
+
+def unless(
+    held: jax.Array, policy_params: PyTree, taken: PolicyStep, metrics: Metrics
+) -> tuple[PyTree, PolicyStep, Metrics]:
+    """What `improve` returned; where `held` [] is true, as if there had been no step."""
+    params = jax.tree.map(lambda old, new: jnp.where(held, old, new), taken.policy_params, policy_params)
+    of_step = {name: jnp.where(held, 0.0, metrics[name]) for name in ("kl", "surrogate", "step_fraction")}
+    return params, dataclasses.replace(taken, fraction=jnp.where(held, 0.0, taken.fraction)), metrics | of_step
 
 
 def _weights(
