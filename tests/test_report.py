@@ -476,6 +476,6 @@ def test_settings_that_a_run_does_not_use_are_shown_as_a_dash(tmp_path: Path) ->
     runs = [make_run(tmp_path / method, method) for method in ("bc", "gail")]
     entries = read_entries(runs)
     page = document.page(entries, document.draw_tasks(entries))
-    assert "<tr><td>bc_epochs</td><td>200</td><td>-</td></tr>" in page
+    assert "<tr><td>actor_learning_rate</td><td>0.001</td><td>-</td></tr>" in page
     assert "<tr><td>env_steps</td><td>-</td><td>30000</td></tr>" in page
     assert "<td>gate</td>" not in page

@@ -138,7 +138,7 @@ def test_folders_of_earlier_versions_are_read_without_their_placeholders(tmp_pat
 
 
 def test_events_advance_where_no_environment_steps_are_taken(tmp_path: Path) -> None:
-    """Behaviour cloning: its axis is the number of passes, chunk after chunk. Others keep environment steps."""
+    """Behaviour cloning: its axis is the number of iterations, chunk after chunk. Others keep environment steps."""
     cloning, steps = tmp_path / "cloning", tmp_path / "steps"
     for folder, rows in ((cloning, {"env_steps": np.zeros((2, 1))}), (steps, {"env_steps": np.full((2, 1), 50)})):
         folder.mkdir()

@@ -209,7 +209,9 @@ def test_a_run_goes_on_for_longer(folder: Path) -> None:
 
 
 def test_a_run_without_a_folder_gets_one_with_a_safe_name(folder: Path) -> None:
-    assert train.main(["--env", TASK, "--method", "bc", "--bc-epochs", "1", "--demos", "expert.npz", *TINY]) == 0
+    assert (
+        train.main(["--env", TASK, "--method", "bc", "--cloning-updates", "100", "--demos", "expert.npz", *TINY]) == 0
+    )
     (made,) = Path("runs").iterdir()
     assert re.fullmatch(r"my_task_make_bc_\d{8}-\d{6}", made.name)
     assert safe_name("a/b[0]:c d,e=1.5e-3") == "a_b_0__c d,e=1.5e-3"
@@ -261,7 +263,19 @@ def test_options_of_a_task_may_be_named_like_those_of_a_run(folder: Path) -> Non
 
 def test_a_run_keeps_the_options_of_its_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the task has other defaults by now."""
-    given = ["--env", TASK, "--method", "bc", "--bc-epochs", "1", "--demos", "expert.npz", "--out", "kept", *TINY]
+    given = [
+        "--env",
+        TASK,
+        "--method",
+        "bc",
+        "--cloning-updates",
+        "100",
+        "--demos",
+        "expert.npz",
+        "--out",
+        "kept",
+        *TINY,
+    ]
     assert train.main(given) == 0
     monkeypatch.setattr(sys.modules["my_task"].make, "__defaults__", (20, 0.3, ()))
     with pytest.raises(SystemExit):  # the demonstrations are of the task as it was
