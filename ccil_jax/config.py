@@ -37,6 +37,7 @@ from ccil_jax.uses import (
     PENALIZED,
     PID,
     SGD,
+    STANDARDIZED,
     Use,
 )
 
@@ -181,7 +182,7 @@ class Config:
         False,
         "whether the cost advantage is shifted to mean 0 and divided by its standard deviation, as the reward's "
         "always is",
-        CONSTRAINED,
+        STANDARDIZED,
     )
     bootstrap_at_truncation: bool = _static(
         True, "whether the future beyond a time limit counts, with the critic's value; false takes 0 for it (authors)"
@@ -527,13 +528,6 @@ def _check_method(config: Config) -> None:
         raise ConfigError(
             f"--multiplier_update {config.multiplier_update}: has no parameter for the outer step of {config.method}; "
             "use adam or sgd, or --method ccil"
-        )
-    if config.standardize_cost_advantage and (
-        config.row.constraint == "trust_region_optimal" or config.multiplier_update == "optimal"
-    ):
-        raise ConfigError(
-            "--standardize_cost_advantage true: the optimal multiplier compares the cost's surrogate with its gap, so "
-            "it must keep its unit; leave it out"
         )
     if LAGRANGIAN_LOSS.holds(config) and config.meta_gradient == "direct":
         raise ConfigError(
