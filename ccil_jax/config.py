@@ -37,8 +37,11 @@ from ccil_jax.uses import (
     PENALIZED,
     PID,
     SGD,
+    STANDARDIZED,
     Use,
 )
+
+CLONING_UPDATES_PER_ITERATION = 100  # after as many gradient steps, cloning looks at the held-out steps
 
 CHOICES: Mapping[str, tuple[str, ...]] = {
     "action_likelihood": ("gaussian", "censored"),
@@ -181,7 +184,7 @@ class Config:
         False,
         "whether the cost advantage is shifted to mean 0 and divided by its standard deviation, as the reward's "
         "always is",
-        CONSTRAINED,
+        STANDARDIZED,
     )
     bootstrap_at_truncation: bool = _static(
         True, "whether the future beyond a time limit counts, with the critic's value; false takes 0 for it (authors)"
@@ -194,8 +197,9 @@ class Config:
     )
     cloning_updates: int = _static(
         0,
-        "passes over the demonstrations in which the policy is cloned from them before anything else is learnt; for bc "
-        "each is one iteration",
+        "gradient steps in which the policy is cloned from the demonstrations before anything else is learnt, rounded "
+        "up to hundreds; for bc each hundred is an iteration. The policy that is kept is the one that is best on the "
+        "held-out tenth of the demonstrations",
         CLONING,
     )
     warmup_iterations: int = _static(
@@ -320,12 +324,15 @@ class Config:
 
     @property
     def num_iterations(self) -> int:
-        """Iterations needed to consume at least `env_steps`; passes over the demonstrations for behaviour cloning."""
-        return (
-            math.ceil(self.env_steps / self.steps_per_iteration)
-            if self.reads("env_steps")
-            else -(-self.cloning_updates // 100)
-        )
+        """Iterations needed to consume at least `env_steps`; those of the cloning for behaviour cloning."""
+        if not self.reads("env_steps"):
+            return self.num_cloning_iterations
+        return math.ceil(self.env_steps / self.steps_per_iteration)
+
+    @property
+    def num_cloning_iterations(self) -> int:
+        """Iterations of behaviour cloning, with at least `cloning_updates` gradient steps in all."""
+        return math.ceil(self.cloning_updates / CLONING_UPDATES_PER_ITERATION)
 
     @property
     def num_held_out(self) -> int:
@@ -528,13 +535,6 @@ def _check_method(config: Config) -> None:
             f"--multiplier_update {config.multiplier_update}: has no parameter for the outer step of {config.method}; "
             "use adam or sgd, or --method ccil"
         )
-    if config.standardize_cost_advantage and (
-        config.row.constraint == "trust_region_optimal" or config.multiplier_update == "optimal"
-    ):
-        raise ConfigError(
-            "--standardize_cost_advantage true: the optimal multiplier compares the cost's surrogate with its gap, so "
-            "it must keep its unit; leave it out"
-        )
     if LAGRANGIAN_LOSS.holds(config) and config.meta_gradient == "direct":
         raise ConfigError(
             "--meta-gradient direct: the lagrangian outer loss depends on the multiplier through the policy alone; use "
@@ -548,6 +548,6 @@ def _check_method(config: Config) -> None:
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
     if config.row.agent == "behavior_cloning" and config.cloning_updates == 0:
-        raise ConfigError("--cloning_updates 0: method bc would learn nothing; give a number such as 200")
+        raise ConfigError("--cloning_updates 0: method bc would learn nothing; give a number such as 20000")
     if LIMITED.holds(config) and config.cost_limit is None:
         raise ConfigError(f"--cost_limit: method {config.method} needs a prescribed episode cost limit")

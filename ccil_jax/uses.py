@@ -46,6 +46,11 @@ PENALIZED = Use(
     lambda config: config.discriminator_regularizer == "gradient_penalty",
 )
 CONSTRAINED = Use(lambda row: row.limit is not None, "methods in which the cost enters ({methods})")
+STANDARDIZED = Use(
+    lambda row: CONSTRAINED.reads(row) and row.constraint != "trust_region_optimal",
+    "methods in which the cost enters, unless the multiplier is optimal: that one needs the cost's unit ({methods})",
+    lambda config: not (config.reads("multiplier_update") and config.multiplier_update == "optimal"),
+)
 LIMITED = Use(lambda row: row.limit == "prescribed", "methods with a prescribed limit ({methods})")
 LAGRANGIAN = Use(
     lambda row: row.constraint in ("lagrangian", "meta_lagrangian"), "methods with a choice of multiplier ({methods})"

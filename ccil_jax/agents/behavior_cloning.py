@@ -13,12 +13,11 @@ from ccil_jax.acting.networks import Policy
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents import contracts
 from ccil_jax.agents.base import Agent
-from ccil_jax.config import Config
+from ccil_jax.config import CLONING_UPDATES_PER_ITERATION, Config
 from ccil_jax.learning.optimizers import Optimizer, adam
 from ccil_jax.types import ExpertData, Metrics, PyTree
 from envs.base import Environment
 
-UPDATES_PER_ITERATION = 100
 SMALLEST_LOG_STD = -4.0  # the likelihood of an action that the expert never varies has no maximum
 
 
@@ -55,7 +54,7 @@ def make(
     policy: Policy | None = None,
     optimizer: Optimizer = adam,
 ) -> Agent:
-    """Builds the agent; an iteration is one pass over the demonstrations."""
+    """Builds the agent; an iteration is `CLONING_UPDATES_PER_ITERATION` gradient steps."""
     assert expert is not None, "bc learns from demonstrations"
     policy = contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim)
     if config.action_likelihood == "censored":
@@ -89,8 +88,8 @@ def make(
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, shuffle_key = jax.random.split(state.key)
-        order = jax.random.randint(shuffle_key, (UPDATES_PER_ITERATION, minibatch_size), 0, obs.shape[0])
-        (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), order)
+        minibatches = jax.random.randint(shuffle_key, (CLONING_UPDATES_PER_ITERATION, minibatch_size), 0, obs.shape[0])
+        (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), minibatches)
         held_out = negative_log_likelihood(apply, params, held_out_obs, expert.held_out_action)
         better = held_out < state.held_out_loss
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), params, state.actor.policy_params)

@@ -21,7 +21,7 @@ from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step, regression, reward_models
 from ccil_jax.learning.constraints import Constraint, EpisodeCosts
 from ccil_jax.learning.optimizers import Optimizer, adam
-from ccil_jax.learning.policy_step import PolicyStep
+from ccil_jax.learning.policy_step import ExpertSteps, PolicyStep
 from ccil_jax.learning.regression import Critic
 from ccil_jax.learning.returns import gae, successor_values
 from ccil_jax.learning.reward_models import RewardModel
@@ -67,7 +67,9 @@ class Parts(NamedTuple):
     constraint: Constraint
     optimizer: Optimizer  # of the critics
     expert: ExpertData | None = None
-    clone: Agent | None = None  # learns the first policy from the demonstrations, one pass a step
+    clone: Agent | None = (
+        None  # clones the first policy from the demonstrations; None where training begins from nought
+    )
 
     @property
     def limit(self) -> jax.Array:
@@ -144,15 +146,11 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
 
 
 def first_actor(parts: Parts, key: jax.Array) -> Actor:
-    """The policy before the first iteration: cloned from the demonstrations where the configuration says so."""
+    """The policy before the first iteration: the clone where there is one, with the demonstrations' statistics."""
     if parts.clone is None:
         return Actor(policy_params=parts.policy.init(key), obs_statistics=running_statistics.init(parts.env.obs_dim))
-    clone = parts.clone
-    state, _ = scan(
-        lambda state, _: clone.step(state),
-        clone.init(key),
-        jnp.arange(-(-parts.config.cloning_updates // behavior_cloning.UPDATES_PER_ITERATION)),
-    )
+    clone, length = parts.clone, parts.config.num_cloning_iterations
+    state, _ = scan(lambda state, _: clone.step(state), clone.init(key), jnp.arange(length))
     return state.actor
 
 
@@ -205,7 +203,7 @@ def generator_steps(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Ag
 def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
     """One batch and what is learnt from it: policy and critics (Algorithm 1 lines 4 to 12)."""
     config, policy, constraint = parts.config, parts.policy, parts.constraint
-    rollout_key, split_key, critic_key, anchor_key = jax.random.split(key, 4)
+    rollout_key, split_key, critic_key, expert_key = jax.random.split(key, 4)
     rollout_state, transition = rollout.rollout(
         parts.env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
     )
@@ -226,7 +224,7 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
         multiplier,
         step_gap,
         held_out,
-        anchor=anchor(parts, state, anchor_key),
+        expert_steps(parts, state, expert_key),
     )
     if parts.clone is not None:
         warming_up = state.iteration < config.warmup_iterations
@@ -235,7 +233,7 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
 
     assert state.actor.obs_statistics is not None
     statistics = state.actor.obs_statistics
-    if parts.clone is None:
+    if parts.clone is None:  # other statistics would make another policy of the clone's parameters
         statistics = running_statistics.update(statistics, transition.obs)
     metrics = step_metrics | {
         "episodes_finished": finished,
@@ -254,14 +252,14 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
     return new, LastBatch(transition=transition, taken=taken, order=order), metrics
 
 
-def anchor(parts: Parts, state: AgentState, key: jax.Array) -> tuple[jax.Array, jax.Array] | None:
-    """As many of the demonstrations' steps as the policy step has samples, drawn at random: obs, action."""
+def expert_steps(parts: Parts, state: AgentState, key: jax.Array) -> ExpertSteps | None:
+    """Steps of the demonstrations, as many as the policy step has samples, drawn at random; None without a clone."""
     if parts.clone is None:
         return None
     assert parts.expert is not None
     indices = jax.random.randint(key, (parts.config.num_training,), 0, len(parts.expert.obs))
     obs = running_statistics.normalize(state.actor.obs_statistics, parts.expert.obs[indices])
-    return obs, parts.expert.action[indices]
+    return ExpertSteps(obs=obs, action=parts.expert.action[indices])
 
 
 def update_constraint(parts: Parts, state: AgentState, reward_state: PyTree, last: LastBatch) -> tuple[PyTree, Metrics]:

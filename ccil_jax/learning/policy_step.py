@@ -32,6 +32,14 @@ class PolicyStep:
     held_out: Batch  # [V]
 
 
+@struct.dataclass(kw_only=True)
+class ExpertSteps:
+    """Steps of the demonstrations, whose likelihood is an objective of the policy step."""
+
+    obs: jax.Array  # [M, obs_dim] normalised
+    action: jax.Array  # [M, action_dim]
+
+
 def random_order(config: Config, key: jax.Array) -> jax.Array:
     """Indices [K] of a batch's samples in random order, the V held-out ones first. The key is consumed.
 
@@ -65,9 +73,12 @@ def improve(
     multiplier: jax.Array,
     step_gap: jax.Array,
     held_out: Batch,
-    anchor: tuple[jax.Array, jax.Array] | None = None,
+    expert: ExpertSteps | None = None,
 ) -> tuple[PyTree, PolicyStep, Metrics]:
-    """The policy step on the training samples (Algorithm 1 line 10, Algorithm 2 lines 8 to 11)."""
+    """The policy step on the training samples (Algorithm 1 line 10, Algorithm 2 lines 8 to 11).
+
+    Where `expert` is given, the demonstrations' mean log likelihood is a third objective beside reward and cost.
+    """
     params, unravel = ravel_pytree(policy_params)
     old = policy_apply(policy_params, batch.obs)
     old_log_prob = distributions.log_prob(old, batch.action)
@@ -79,8 +90,9 @@ def improve(
         reward = jnp.mean(weights * batch.reward_advantage) + bonus
         cost = jnp.mean(weights * batch.cost_advantage) - bonus * float(constraint.entropy_in_cost)
         found = [reward, cost]
-        if anchor is not None:
-            found.append(jnp.mean(distributions.log_prob(policy_apply(unravel(params), anchor[0]), anchor[1])))
+        if expert is not None:
+            cloned = distributions.log_prob(policy_apply(unravel(params), expert.obs), expert.action)
+            found.append(jnp.mean(cloned))
         return jnp.stack(found), jnp.mean(distributions.kl_divergence(old, new))
 
     gradients = jax.jacrev(lambda params: objectives(params)[0])(params)

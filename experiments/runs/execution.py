@@ -106,7 +106,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
 def _announcement(program: ProgramPlan) -> str:
     setup, config = program.setup, program.config
     several = f"{len(program.runs)} configurations of " if len(program.runs) > 1 else ""
-    length = f"{config.cloning_updates} passes" if not config.reads("env_steps") else f"{config.env_steps:,} steps"
+    length = f"{config.cloning_updates:,} updates" if not config.reads("env_steps") else f"{config.env_steps:,} steps"
     return (
         f"{config.method} on {setup.task}: {several}{setup.num_seeds} seed(s), {length} each, into "
         f"{program.checkpoint_dir.parent}"

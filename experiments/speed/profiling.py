@@ -66,8 +66,10 @@ def pieces_of(parts: Parts) -> Pieces:
         return policy_step.split(samples, config.num_held_out, policy_step.random_order(config, key))
 
     def improve(state: AgentState, training: Batch, held_out: Batch) -> Any:
-        params = state.actor.policy_params
-        return policy_step.improve(config, policy.apply, constraint, params, training, multiplier, zero, held_out)
+        params, steps = state.actor.policy_params, on_policy.expert_steps(parts, state, jax.random.key(0))
+        return policy_step.improve(
+            config, policy.apply, constraint, params, training, multiplier, zero, held_out, steps
+        )
 
     def fit(state: AgentState, training: Batch, key: jax.Array) -> Any:
         return on_policy.fit_critics(parts, state.critics, training, key)
