@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHOD
     "gail that begins with a clone": {"method": "gail", "cloning_updates": 200},
 }
 # Multiplied by the weight 0 of a cost that does not enter: a dependence by the text of the program alone.
-TIMES_ZERO = {"cost_gae_lambda", "standardize_cost_advantage"}
+TIMES_ZERO = {"cost_gae_lambda"}
 NOTHING = dict.fromkeys(("gail", "trpo", "gail without a penalty", "gail that begins with a clone"), TIMES_ZERO)
 OTHER: dict[str, Any] = {  # another value of each static field that narrows what a method is
     "discriminator_steps": 2,
