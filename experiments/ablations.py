@@ -44,7 +44,40 @@ def _preset(name: str, method: str) -> dict[str, Any]:
     return {field: value for field, value in PRESETS[name].items() if field not in idle}
 
 
+def _after_cloning(text: str, field: str, values: Sequence[Any]) -> Question:
+    return Question(text, "malm", {str(value): {"cloning_updates": 20_000, field: value} for value in values})
+
+
 QUESTIONS: Mapping[str, Question] = {
+    "cloning_updates": _one_field("Does it help to begin with a clone?", "cloning_updates", (20_000, 0)),
+    "action_likelihood": _one_field(
+        "Is an action at a bound taken for all draws beyond it?", "action_likelihood", ("censored", "gaussian")
+    ),
+    "cloning_weight": _after_cloning(
+        "How much do the demonstrations weigh in the policy's objective?", "cloning_weight", (0.3, 0.0, 0.1, 1.0, 3.0)
+    ),
+    "warmup_iterations": _after_cloning(
+        "Do critics and discriminator need a start before the policy moves?", "warmup_iterations", (5, 0)
+    ),
+    "outer_loss": Question(
+        "Which outer loss?",
+        "malm",
+        {
+            "lagrangian": {"outer_loss": "lagrangian"},
+            "squared": {"outer_loss": "squared"},
+            "none": {"meta_gradient": "none"},
+        },
+    ),
+    "gap_unit": Question(
+        "Is the gap that the dual step follows relative to the limit?",
+        "malm",
+        {
+            "limit, 0.5": {"multiplier_update": "sgd", "gap_unit": "limit", "multiplier_learning_rate": 0.5},
+            "limit, 0.05": {"multiplier_update": "sgd", "gap_unit": "limit", "multiplier_learning_rate": 0.05},
+            "cost, 0.0005": {"multiplier_update": "sgd", "gap_unit": "cost", "multiplier_learning_rate": 0.0005},
+        },
+    ),
+    "batch_size": _one_field("How large a batch?", "batch_size", (4000, 2000, 8000)),
     "meta_gradient": _one_field(
         "Does the multiplier's gradient through the policy step help?",
         "meta_gradient",

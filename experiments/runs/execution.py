@@ -88,6 +88,11 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         for plan, result in trained:
             for seed in np.flatnonzero(result.stopped):
                 display.message(f"seed {seed} stopped: {fault_files.write(plan.folder, result, int(seed))}")
+            for seed in _at_largest_multiplier(result):
+                display.message(
+                    f"seed {seed}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, and the "
+                    "cost is still above its limit: it does not follow the multiplier"
+                )
         display.message(f"evaluating {setup.eval_episodes} episodes per seed ...")
         evaluations, random = _evaluate(setup, [result for _, result in trained], env)
         return [
@@ -101,6 +106,15 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
             )
             for (plan, result), evaluated in zip(trained, evaluations, strict=True)
         ]
+
+
+def _at_largest_multiplier(result: "Result") -> list[int]:
+    """The seeds whose multiplier could not rise any further while the cost was above its limit."""
+    config, metrics = result.config, result.metrics
+    if not config.has_multiplier or config.cost_limit is None or not metrics:
+        return []
+    above = np.asarray(metrics["episode_cost"])[-1] > config.cost_limit
+    return [int(i) for i in np.flatnonzero(above & (np.asarray(metrics["multiplier"])[-1] >= config.multiplier_max))]
 
 
 def _announcement(program: ProgramPlan) -> str:
