@@ -92,10 +92,11 @@ def _censored_log_prob(distribution: CensoredGaussian, action: jax.Array) -> jax
     at_bound = (action <= low) | (action >= high)
     beyond = jnp.where(action <= low, low - mean, mean - high)  # from the mean to the bound, positive if it is beyond
     standardized = jnp.where(at_bound, beyond, action - mean) * jnp.exp(-log_std)
-    density = -0.5 * (standardized**2 + math.log(2 * math.pi)) - log_std
     # 0 where it is not needed: there a bound may be infinite, and infinity times a derivative of 0 is NaN.
     tail = jax.scipy.special.log_ndtr(jnp.where(at_bound, standardized, 0.0))
-    return jnp.sum(jnp.where(at_bound, tail, density), axis=-1)
+    # Added up as the Gaussian's are, so that without an entry at a bound the sum is the same to the last bit.
+    quadratic = jnp.where(at_bound, -2 * tail, standardized**2 + math.log(2 * math.pi))
+    return -0.5 * jnp.sum(quadratic, axis=-1) - jnp.sum(jnp.where(at_bound, 0.0, log_std), axis=-1)
 
 
 def kl_divergence(old: Gaussian | CensoredGaussian, new: Gaussian | CensoredGaussian) -> Float[Array, "..."]:
