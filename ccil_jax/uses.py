@@ -93,5 +93,5 @@ IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
 ACTOR = Use(
     lambda row: row.agent == "iq_learn" or CLONING.reads(row),
     "{methods}; an on-policy method only if its cloning_updates are above 0",
-    lambda config: config.row.agent == "iq_learn" or config.cloning_updates > 0,
+    lambda config: config.row.agent != "on_policy" or config.cloning_updates > 0,
 )

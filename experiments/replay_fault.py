@@ -43,6 +43,7 @@ def replay(path: Path, demos: Path | None = None) -> list[str]:
         The names of the metrics and of the parts of the state that are not finite afterwards.
     """
     run = run_folder.parse_run(path, fault_files.read_facts(path))
+    run_folder.check_continues(run, f"FILE {path}")
     task = run_folder.task_of(run)
     demonstrations = _demonstrations(run.facts["demonstrations"], demos)
 

@@ -41,16 +41,17 @@ FIELDS = {  # each method gets those that it uses
     "critic_minibatch_size": 8,
     "critic_epochs": 2,
     "fisher_stride": 2,
-    "bc_epochs": NUM_ITERATIONS,
 }
 
 
 def options(method: str) -> list[str]:
     """What `train` is given, but for demonstrations and folder."""
-    from ccil_jax.config import Config, unused
+    from ccil_jax.config import CLONING_UPDATES_PER_ITERATION, Config, unused
 
     idle = unused(Config(method=method))
     used = {name: value for name, value in FIELDS.items() if name not in idle}
+    if method == "bc":
+        used["cloning_updates"] = CLONING_UPDATES_PER_ITERATION * NUM_ITERATIONS
     return [*RUN, "--method", method, *(f"--{name.replace('_', '-')}={value}" for name, value in used.items())]
 
 

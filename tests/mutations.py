@@ -32,8 +32,8 @@ MUTATIONS = (
     Mutation(
         "reward and cost change places in the policy's objectives",
         "ccil_jax/learning/policy_step.py",
-        "return jnp.stack([reward, cost])",
-        "return jnp.stack([cost, reward])",
+        "found = [reward, cost]",
+        "found = [cost, reward]",
         ("tests/test_constraints.py",),
     ),
     Mutation(

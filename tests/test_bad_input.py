@@ -116,8 +116,8 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "--batch-size 2000 is not divisible by --num-envs 17; use --batch-size 1989",
     ),
     "minibatch too large": (
-        (*TRAIN, "--discriminator-minibatch-size", "4000"),
-        "--discriminator-minibatch-size 4000 exceeds the batch; use --discriminator-minibatch-size 2000",
+        (*TRAIN, "--discriminator-minibatch-size", "8000"),
+        "--discriminator-minibatch-size 8000 exceeds the batch; use --discriminator-minibatch-size 4000",
     ),
     "nothing held out": ((*TRAIN, "--held-out-fraction", "0"), "--held-out-fraction 0.0"),
     "limit missing": ((*TRAIN, "--method", "lgail"), "--cost-limit"),

@@ -42,7 +42,7 @@ def clone(demonstrations: Demonstrations, num_seeds: int = 1, **changes: Any) ->
 
 def test_it_finds_the_mean_and_the_deviation_of_a_gaussian_expert() -> None:
     demonstrations = linear_expert(4000)
-    result = clone(demonstrations, bc_epochs=40, actor_learning_rate=3e-3)
+    result = clone(demonstrations, cloning_updates=4_500, actor_learning_rate=3e-3)
     actor = jax.tree.map(lambda leaf: leaf[0], result.actor)
     mean, log_std = numpy_policy(actor.policy_params, normalize(actor.obs_statistics, jnp.asarray(demonstrations.obs)))
     truth = 0.1 + demonstrations.obs @ SLOPE
@@ -60,7 +60,13 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
     demonstrations = linear_expert(30)
     env = Walk()
     config = build.resolve(
-        walk_config(method="bc", hidden_sizes=(32,), critic_minibatch_size=9, actor_learning_rate=0.02),
+        walk_config(
+            method="bc",
+            cloning_updates=2_000,
+            hidden_sizes=(32,),
+            critic_minibatch_size=9,
+            actor_learning_rate=0.001,
+        ),
         env,
         demonstrations,
     )
@@ -79,7 +85,7 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
 
 def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
     def train(directory: Path | None = None, **options: Any) -> runner.Result:
-        config = walk_config(method="bc", bc_epochs=20)
+        config = walk_config(method="bc", cloning_updates=2_000)
         demonstrations = walk_demonstrations()
         with quick_compilation():
             return runner.train(config, Walk(), demonstrations, num_seeds=2, checkpoint_dir=directory, **options)
@@ -89,5 +95,5 @@ def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
     resumed = train(tmp_path, resume=True)
     assert_same_bits(resumed.state, whole.state)
     assert_same_bits({name: resumed.metrics[name] for name in whole.metrics}, whole.metrics)
-    loaded = runner.load(walk_config(method="bc", bc_epochs=20), Walk(), tmp_path, 2)
+    loaded = runner.load(walk_config(method="bc", cloning_updates=2_000), Walk(), tmp_path, 2)
     assert_same_bits(loaded.actor, whole.actor)

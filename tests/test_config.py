@@ -28,23 +28,30 @@ from tests.probe_envs import Walk, walk_config, walk_demonstrations
 # Who uses what ------------------------------------------------------------------------------------------------------
 
 VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHODS} | {
+    "bc": {"method": "bc", "cloning_updates": 200},
     "malm without an outer step": {"method": "malm", "meta_gradient": "none"},
     "malm that holds nothing out": {"method": "malm", "meta_gradient": "none", "held_out_fraction": 0.0},
     "ccil with a controller": {"method": "ccil", "multiplier_update": "pid"},
     "expert with the optimal multiplier": {"method": "expert", "multiplier_update": "optimal"},
     "gail without a penalty": {"method": "gail", "discriminator_regularizer": "none"},
+    "malm by projected ascent": {"method": "malm", "multiplier_update": "sgd"},
+    "malm with the Lagrangian as outer loss": {"method": "malm", "outer_loss": "lagrangian"},
+    "ccil that begins with a clone": {"method": "ccil", "cloning_updates": 200},
+    "gail that begins with a clone": {"method": "gail", "cloning_updates": 200},
 }
 # Multiplied by the weight 0 of a cost that does not enter: a dependence by the text of the program alone.
-TIMES_ZERO = {"cost_gae_lambda", "standardize_cost_advantage"}
-NOTHING = dict.fromkeys(("gail", "trpo", "gail without a penalty"), TIMES_ZERO)
+TIMES_ZERO = {"cost_gae_lambda"}
+NOTHING = dict.fromkeys(("gail", "trpo", "gail without a penalty", "gail that begins with a clone"), TIMES_ZERO)
 OTHER: dict[str, Any] = {  # another value of each static field that narrows what a method is
     "discriminator_steps": 2,
     "discriminator_minibatch_size": 8,
     "held_out_fraction": 0.5,
     "meta_gradient": "direct",
+    "outer_loss": "lagrangian",
     "outer_advantage": "re-evaluated",
     "held_out_unit": "trajectory",
     "multiplier_update": "sgd",
+    "gap_unit": "limit",
     "meta_update": "sgd",
     "gate": "episode",
     "reward_form": "logit",
@@ -55,8 +62,11 @@ OTHER: dict[str, Any] = {  # another value of each static field that narrows wha
     "value_loss": "v0",
     "cg_iterations": 3,
     "bootstrap_at_truncation": False,
+    "action_likelihood": "censored",
+    "cloning_updates": 300,
+    "warmup_iterations": 2,
 }
-OUTSIDE = {"env_steps", "bc_epochs", "max_skipped_updates"}  # how long, and when to give up: not of an iteration
+OUTSIDE = {"env_steps", "max_skipped_updates"}  # how long, and when to give up: not of an iteration
 
 
 def resolved(changes: dict[str, Any]) -> Config:

@@ -12,7 +12,7 @@ import pytest
 
 from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
-from ccil_jax.config import Config, unused
+from ccil_jax.config import CLONING_UPDATES_PER_ITERATION, Config, unused
 from ccil_jax.methods import METHODS
 from ccil_jax.training.checkpointing import Checkpointer
 from ccil_jax.training.manifests import Identity
@@ -69,7 +69,9 @@ NUM_ITERATIONS = 20
 def config_of(method: str) -> Config:
     limit = {"cost_limit": 1.0} if METHODS[method].limit == "prescribed" else {}
     config = walk_config(method=method, **limit)
-    lengths = {"env_steps": NUM_ITERATIONS * 64, "bc_epochs": NUM_ITERATIONS, "replay_size": 64}
+    if method == "bc":
+        return config.replace(cloning_updates=NUM_ITERATIONS * CLONING_UPDATES_PER_ITERATION)
+    lengths = {"env_steps": NUM_ITERATIONS * 64, "replay_size": 64}
     return config.replace(**{name: value for name, value in lengths.items() if name not in unused(config)})
 
 

@@ -136,8 +136,9 @@ def test_optimizer_and_critic_of_a_users_own_are_used() -> None:
     ],
 )
 def test_parts_without_effect_are_refused(method: str, parts: dict[str, Any], message: str) -> None:
+    config = walk_config(method=method, **({"cloning_updates": 100} if method == "bc" else {}))
     with pytest.raises(ConfigError, match=message):
-        ccil_jax.make_agent(walk_config(method=method), Walk(), walk_demonstrations(), **parts)
+        ccil_jax.make_agent(config, Walk(), walk_demonstrations(), **parts)
 
 
 def test_a_row_whose_part_is_unknown_is_refused_before_anything_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:

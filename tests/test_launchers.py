@@ -46,13 +46,15 @@ def test_options_are_the_fields_of_config() -> None:
     assert {*options.CONFIG_FIELDS} - {"method"} <= set(vars(parser.parse_args(_every_option())))
 
 
-@pytest.mark.parametrize(("launcher", "batch_size"), [(train, 2000), (expert, 4000)])
-def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleType, batch_size: int) -> None:
+@pytest.mark.parametrize(("launcher", "name"), [(train, "default"), (expert, "expert")])
+def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleType, name: str) -> None:
     text = " ".join(launcher.make_parser().format_help().split())
     preset = re.search(r"hyperparameters to start from \(default: (\w+)\)", text)
     assert preset
-    assert PRESETS[preset[1]].get("batch_size", Config().batch_size) == batch_size
-    assert f"batch of its own (Table 1) (default: {batch_size}; static)" in text
+    assert preset[1] == name
+    assert len({PRESETS[preset]["env_steps"] for preset in ("default", "expert")} | {Config().env_steps}) == 3
+    assert f"rounded up to whole iterations (default: {PRESETS[name]['env_steps']}; static)" in text
+    assert f"batch of its own (Table 1) (default: {PRESETS[name]['batch_size']}; static)" in text
 
 
 def _every_option() -> list[str]:

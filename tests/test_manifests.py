@@ -207,12 +207,62 @@ def test_a_field_that_may_move_is_not_compared(folder: Path) -> None:
         checkpoints.restore(3, shapes(state(0)))
 
 
-def test_a_checkpoint_of_before_there_were_identities_is_compared_by_its_configuration(folder: Path) -> None:
-    path = folder / "3" / manifests.NAME
-    manifest = json.loads(path.read_text())
+def rewrite(step: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    """Changes the manifest of a step, whose digest then agrees with it, as another version would have written it."""
+    manifest = json.loads((step / manifests.NAME).read_text())
     del manifest["sha256"]
-    manifest["config"] = manifest.pop("identity")["configs"][0]
-    path.write_text(json.dumps({**manifest, "sha256": manifests._sha256(manifest)}))
+    change(manifest)
+    (step / manifests.NAME).write_text(json.dumps({**manifest, "sha256": manifests._sha256(manifest)}))
+
+
+def of_earlier_version(manifest: dict[str, Any]) -> None:
+    """Before the policy could begin with a clone."""
+    for config in manifest["identity"]["configs"]:
+        for name in ("action_likelihood", "cloning_updates", "warmup_iterations", "cloning_weight", "gap_unit"):
+            del config[name]
+        config["bc_epochs"] = 200
+
+
+def test_a_field_that_a_checkpoint_does_not_name_has_its_default(folder: Path) -> None:
+    rewrite(folder / "3", of_earlier_version)
+    with Checkpointer(folder, IDENTITY) as checkpoints:
+        assert_same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
+    for name, default, value in (("action_likelihood", "gaussian", "censored"), ("cloning_updates", 0, 100)):
+        identity = other(configs=(CONFIG.replace(**{name: value}), IDENTITY.configs[1]))
+        message = f"written with {name} {default}, this run has {value}"
+        with Checkpointer(folder, identity) as checkpoints, pytest.raises(CheckpointError, match=message):
+            checkpoints.restore(3, shapes(state(0)))
+
+
+def test_a_field_that_is_gone_matters_to_the_methods_that_read_it(folder: Path) -> None:
+    cloning = Config(method="bc", cloning_updates=100)
+
+    def of_cloning(manifest: dict[str, Any]) -> None:
+        manifest["identity"]["configs"][0]["method"] = "bc"
+        of_earlier_version(manifest)
+
+    rewrite(folder / "3", of_cloning)
+    identity = other(configs=(cloning, IDENTITY.configs[1]))
+    message = "3: written with bc_epochs 200 by an earlier version: bc now counts gradient steps .*; continue with the"
+    with Checkpointer(folder, identity) as checkpoints, pytest.raises(CheckpointError, match=message):
+        checkpoints.check_identity(3)
+    identity = other(configs=(cloning.replace(cloning_updates=0), IDENTITY.configs[1]))
+    with Checkpointer(folder, identity, free=frozenset({"bc_epochs"})) as checkpoints:  # as for acting alone
+        assert_same_bits(checkpoints.restore(3, shapes(state(0))), state(3))
+
+
+def test_a_field_of_a_later_version_is_refused(folder: Path) -> None:
+    rewrite(folder / "3", lambda manifest: manifest["identity"]["configs"][1].update(new_field=3))
+    message = "written with new_field 3, this run has None"
+    with Checkpointer(folder, IDENTITY) as checkpoints, pytest.raises(CheckpointError, match=message):
+        checkpoints.check_identity(3)
+
+
+def test_a_checkpoint_of_before_there_were_identities_is_compared_by_its_configuration(folder: Path) -> None:
+    def drop(manifest: dict[str, Any]) -> None:
+        manifest["config"] = manifest.pop("identity")["configs"][0]
+
+    rewrite(folder / "3", drop)
     with Checkpointer(folder, other(seed=7)) as checkpoints:
         checkpoints.restore(3, shapes(state(0)))
     identity = other(configs=(CONFIG.replace(gamma=0.5),))

@@ -211,6 +211,7 @@ def test_cancelling_directions_have_a_finite_derivative() -> None:
 
 
 REWARD, COST = np.array([1.0, -2.0, 3.0, 0.5]), np.array([1.0, 0.0, 1.0, 2.0])
+COST_ADVANTAGE = np.array([0.5, -1.0, 2.0, 1.5])
 FIXED_POINT = (1 + 3 + 1) / (1 + 1 + 4)  # mean(A_r d) / mean(d^2)
 
 
@@ -218,6 +219,7 @@ def constant_weights(value: float) -> Outer:
     """An outer problem whose importance weights do not depend on the multiplier."""
     return Outer(
         reward_advantage=jnp.asarray(REWARD),
+        cost_advantage=jnp.asarray(COST_ADVANTAGE),
         cost=jnp.asarray(COST),
         importance_weights=lambda multiplier: jnp.full(4, value) + 0 * multiplier,
     )

@@ -27,7 +27,10 @@ def test_flipped_labels_would_be_noticed() -> None:
 def test_a_dropped_indirect_term_would_be_noticed() -> None:
     """Weights that grow with lambda: d/d lambda mean((w A - lambda' d)^2) = 2 (w A - lambda' d) A w'."""
     outer = Outer(
-        reward_advantage=jnp.array([2.0]), cost=jnp.array([1.0]), importance_weights=lambda x: 1 + 3 * x[None]
+        reward_advantage=jnp.array([2.0]),
+        cost_advantage=jnp.array([0.0]),
+        cost=jnp.array([1.0]),
+        importance_weights=lambda x: 1 + 3 * x[None],
     )
     found = {
         kind: float(constraints.outer_gradient(kind, jnp.asarray(0.1), jnp.asarray(0.2), outer))

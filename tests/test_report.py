@@ -258,19 +258,19 @@ def test_curves_of_single_seeds_and_of_none_that_is_known() -> None:
     assert figures.png(figure).startswith(b"\x89PNG")
 
 
-def test_cloning_is_drawn_against_passes_beside_runs_that_take_steps(tmp_path: Path) -> None:
+def test_cloning_is_drawn_against_its_iterations_beside_runs_that_take_steps(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a", "gail"), make_run(tmp_path / "b", "bc")]
     figure = figures.draw_panels([figures.read_curve(folder) for folder in folders], "Swimmer")
     drawn = {axes.get_title(loc="left"): axes for axes in figure.axes}
     assert {title: axes.get_xlabel() for title, axes in drawn.items()} == {
         **dict.fromkeys(("Return", "Cost per episode", "Cost rate"), "iterations of 6,000 steps"),
-        **dict.fromkeys(("Loss, nats", "Loss on held-out steps, nats"), "passes over the demonstrations"),
+        **dict.fromkeys(("Loss, nats", "Loss on held-out steps, nats"), "iterations of 100 gradient steps"),
     }
     np.testing.assert_array_equal(drawn["Loss, nats"].lines[-1].get_xdata(), [1, 2, 3, 4, 5])
     assert drawn["Loss, nats"].lines[-1].get_color() == figures.COLORS[1]
     both = [{"env_steps": steps * np.ones((4, 1)), "loss": np.ones((4, 1))} for steps in (0, 7)]
     panels = figures.panels_of([figures.Curve("x", metrics, {}, None) for metrics in both])  # one metric of both kinds
-    assert [(panel.metric, panel.by_passes, list(panel.curves)) for panel in panels] == [
+    assert [(panel.metric, panel.cloning, list(panel.curves)) for panel in panels] == [
         ("loss", False, [1]),
         ("loss", True, [0]),
     ]
@@ -476,6 +476,6 @@ def test_settings_that_a_run_does_not_use_are_shown_as_a_dash(tmp_path: Path) ->
     runs = [make_run(tmp_path / method, method) for method in ("bc", "gail")]
     entries = read_entries(runs)
     page = document.page(entries, document.draw_tasks(entries))
-    assert "<tr><td>bc_epochs</td><td>200</td><td>-</td></tr>" in page
+    assert "<tr><td>actor_learning_rate</td><td>0.001</td><td>-</td></tr>" in page
     assert "<tr><td>env_steps</td><td>-</td><td>30000</td></tr>" in page
     assert "<td>gate</td>" not in page

@@ -1,6 +1,7 @@
 """The files of a run folder: one row per iteration and seed, strict JSON, nothing twice after a resumption."""
 
 import csv
+import dataclasses
 import errno
 import json
 import struct
@@ -11,8 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ccil_jax.config import Config
+from ccil_jax.presets import PRESETS
+from experiments.cli import options
 from experiments.cli.command_line import UsageError
-from experiments.runs import provenance, run_folder
+from experiments.runs import provenance, resuming, run_folder
 from experiments.runs.metrics_file import MetricsWriter, read_metrics
 
 
@@ -138,7 +142,7 @@ def test_folders_of_earlier_versions_are_read_without_their_placeholders(tmp_pat
 
 
 def test_events_advance_where_no_environment_steps_are_taken(tmp_path: Path) -> None:
-    """Behaviour cloning: its axis is the number of passes, chunk after chunk. Others keep environment steps."""
+    """Behaviour cloning: its axis is the number of iterations, chunk after chunk. Others keep environment steps."""
     cloning, steps = tmp_path / "cloning", tmp_path / "steps"
     for folder, rows in ((cloning, {"env_steps": np.zeros((2, 1))}), (steps, {"env_steps": np.full((2, 1), 50)})):
         folder.mkdir()
@@ -148,3 +152,65 @@ def test_events_advance_where_no_environment_steps_are_taken(tmp_path: Path) -> 
                 writer.write(iteration, rows | {"loss": np.ones((2, 1))})
     assert [step for step, _ in events(cloning)] == [1, 2, 3, 4]
     assert [step for step, _ in events(steps)] == [50] * 4
+
+
+# Earlier versions ----------------------------------------------------------------------------------------------------
+
+FACTS: dict[str, Any] = {
+    "task": "Swimmer",
+    "physics": "native",
+    "env_options": {},
+    "preset": "default",
+    "command": "train",
+    "seed": 0,
+    "num_seeds": 2,
+    "eval_episodes": 50,
+    "demonstrations": None,
+    **dict.fromkeys(("expert_return", "expert_cost", "expert_length")),
+}
+
+
+def earlier_run(folder: Path, **fields: Any) -> Path:
+    """A run folder as it was before the policy could begin with a clone; `fields` differ from the defaults."""
+    run_folder.write_config(folder, Config(**fields), FACTS)
+    content = run_folder.read_json(folder / "config.json")
+    for name in ("action_likelihood", "cloning_updates", "warmup_iterations", "cloning_weight", "outer_loss"):
+        del content["config"][name]
+    run_folder.write_json(folder / "config.json", {**content, "config": {**content["config"], "bc_epochs": 150}})
+    return folder
+
+
+def test_a_run_of_an_earlier_version_has_the_defaults_of_what_it_does_not_say(tmp_path: Path) -> None:
+    """Also where the preset that it began with says something else by now."""
+    fields: dict[str, Any] = {"method": "ccil", "gamma": 0.9, "cost_limit": 3.0}
+    run = run_folder.read_run(earlier_run(tmp_path, **fields))
+    assert run.config == Config(**fields)
+    assert not run.gone
+    assert "bc_epochs" not in run.settings
+    saved = resuming.resumed(tmp_path, {})
+    assert (saved["cloning_updates"], saved["action_likelihood"], saved["gamma"]) == (0, "gaussian", 0.9)
+    assert PRESETS["default"]["cloning_updates"] > 0
+    config = options.config_from({}, "default", saved)
+    assert {name for name, value in dataclasses.asdict(config).items() if value != getattr(run.config, name)} == {
+        "cost_limit"  # is resolved from the demonstrations, once more
+    }
+
+
+def test_a_cloning_of_an_earlier_version_is_read_and_not_continued(tmp_path: Path) -> None:
+    run = run_folder.read_run(earlier_run(tmp_path, method="bc", actor_learning_rate=0.01))
+    assert run.config == Config(method="bc", actor_learning_rate=0.01)
+    assert run.gone == {"bc_epochs": 150}
+    assert run.settings["bc_epochs"] == 150
+    assert "cloning_updates" not in run.settings
+    for given in ({}, {"cloning_updates": 300}):
+        message = r"--resume: .*written with bc_epochs 150 by an earlier version: bc now counts gradient steps \("
+        with pytest.raises(UsageError, match=message + r"cloning_updates\), .*begin a new run in another folder$"):
+            resuming.resumed(tmp_path, given)
+
+
+def test_a_field_of_another_version_is_named(tmp_path: Path) -> None:
+    content = run_folder.read_json(earlier_run(tmp_path) / "config.json")
+    content["config"]["new_field"] = 1
+    run_folder.write_json(tmp_path / "config.json", content)
+    with pytest.raises(UsageError, match="field 'new_field' is not known to this version; use the version that wrote"):
+        run_folder.read_run(tmp_path)

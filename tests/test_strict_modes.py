@@ -32,7 +32,17 @@ LEARNERS: dict[str, dict[str, Any]] = {
     "ccil": {"method": "ccil", "discriminator_regularizer": "spectral_norm"},
     "cpo_il": {"method": "cpo_il"},
     "pid_il": {"method": "pid_il"},
-    "bc": {"method": "bc"},
+    "bc": {"method": "bc", "cloning_updates": 200},
+    "a clone": {
+        "method": "malm",
+        "cloning_updates": 200,
+        "warmup_iterations": 1,
+        "cloning_weight": 0.1,
+        "action_likelihood": "censored",
+        "outer_loss": "lagrangian",
+        "multiplier_update": "sgd",
+        "gap_unit": "limit",
+    },
     "iq_learn": {"method": "iq_learn", "critic_minibatch_size": 8},
     "expert": {"method": "expert", "cost_limit": 2.0},
 }
@@ -56,7 +66,8 @@ def strict_tracing(x64: bool) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("name", "x64"), [*((name, False) for name in LEARNERS), *((name, True) for name in ("malm", "iq_learn"))]
+    ("name", "x64"),
+    [*((name, False) for name in LEARNERS), *((name, True) for name in ("malm", "a clone", "iq_learn"))],
 )
 def test_learners_mix_neither_types_nor_ranks_and_use_keys_once(name: str, x64: bool) -> None:
     env, choices = Walk(), LEARNERS[name]

@@ -49,7 +49,7 @@ def test_the_fisher_product_is_the_dense_fisher_matrix_of_scores_and_of_kl() -> 
         flat, unravel = ravel_pytree(problem.params)
 
         def policy(params: jax.Array) -> distributions.Gaussian:
-            return problem.policy.apply(unravel(params), problem.training.obs)
+            return distributions.gaussian_of(problem.policy.apply(unravel(params), problem.training.obs))
 
         def divergence(params: jax.Array) -> jax.Array:
             return jnp.mean(distributions.kl_divergence(policy(flat), policy(params)))

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,10 +15,11 @@ import pytest
 from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.errors import UserError
 from ccil_jax.methods import _methods
+from ccil_jax.training import manifests
 from experiments import ablations, benchmark, convert, evaluate, expert, report, sweep, train
 from experiments.cli import command_line
 from experiments.cli.names import safe_name
-from experiments.runs import run_folder
+from experiments.runs import figures, run_folder
 from experiments.runs.environments import build_environment
 from experiments.runs.metrics_file import read_metrics
 from experiments.sweeps import backends, worker
@@ -209,7 +211,9 @@ def test_a_run_goes_on_for_longer(folder: Path) -> None:
 
 
 def test_a_run_without_a_folder_gets_one_with_a_safe_name(folder: Path) -> None:
-    assert train.main(["--env", TASK, "--method", "bc", "--bc-epochs", "1", "--demos", "expert.npz", *TINY]) == 0
+    assert (
+        train.main(["--env", TASK, "--method", "bc", "--cloning-updates", "100", "--demos", "expert.npz", *TINY]) == 0
+    )
     (made,) = Path("runs").iterdir()
     assert re.fullmatch(r"my_task_make_bc_\d{8}-\d{6}", made.name)
     assert safe_name("a/b[0]:c d,e=1.5e-3") == "a_b_0__c d,e=1.5e-3"
@@ -261,13 +265,88 @@ def test_options_of_a_task_may_be_named_like_those_of_a_run(folder: Path) -> Non
 
 def test_a_run_keeps_the_options_of_its_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the task has other defaults by now."""
-    given = ["--env", TASK, "--method", "bc", "--bc-epochs", "1", "--demos", "expert.npz", "--out", "kept", *TINY]
+    given = [
+        "--env",
+        TASK,
+        "--method",
+        "bc",
+        "--cloning-updates",
+        "100",
+        "--demos",
+        "expert.npz",
+        "--out",
+        "kept",
+        *TINY,
+    ]
     assert train.main(given) == 0
     monkeypatch.setattr(sys.modules["my_task"].make, "__defaults__", (20, 0.3, ()))
     with pytest.raises(SystemExit):  # the demonstrations are of the task as it was
         train.main([*given[:-7], "--out", "other", *TINY])
     assert train.main(["--resume", "--out", "kept"]) == 0
     assert run_folder.read_run(Path("kept")).facts["env_options"]["push"] == 0.2
+
+
+def make_earlier(folder: Path) -> None:
+    """Turns a run folder into one of before the policy could begin with a clone and bc counted gradient steps."""
+
+    def change(config: dict[str, Any]) -> None:
+        for name in ("action_likelihood", "cloning_updates", "warmup_iterations", "cloning_weight", "outer_loss"):
+            del config[name]
+        config["bc_epochs"] = 200
+
+    content = run_folder.read_json(folder / "config.json")
+    change(content["config"])
+    run_folder.write_json(folder / "config.json", content)
+    for path in folder.glob(f"checkpoints/*/{manifests.NAME}"):
+        manifest = run_folder.read_json(path)
+        del manifest["sha256"]
+        change(manifest["identity"]["configs"][0])
+        path.write_text(json.dumps({**manifest, "sha256": manifests._sha256(manifest)}))
+
+
+def test_a_run_of_an_earlier_version_goes_on_bit_for_bit(folder: Path) -> None:
+    for name in ("earlier", "undisturbed"):
+        shutil.copytree("run", name)
+    make_earlier(Path("earlier"))
+    for name in ("earlier", "undisturbed"):
+        assert train.main(["--resume", "--out", name, "--env-steps", "480"]) == 0
+    earlier, undisturbed = (Path(name, "metrics.csv").read_bytes() for name in ("earlier", "undisturbed"))
+    assert len(earlier.splitlines()) == 1 + 4 * 2
+    assert earlier == undisturbed
+
+
+def test_a_cloning_of_an_earlier_version_is_evaluated_and_reported_but_not_continued(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [
+        "--env",
+        TASK,
+        "--method",
+        "bc",
+        "--cloning-updates",
+        "200",
+        "--demos",
+        "expert.npz",
+        "--out",
+        "old",
+        *TINY,
+    ]
+    assert train.main(given) == 0
+    assert evaluate.main(["old", "--episodes", "3", "--out", "before.json"]) == 0
+    make_earlier(Path("old"))
+    assert evaluate.main(["old", "--episodes", "3", "--out", "after.json"]) == 0
+    before, after = (run_folder.read_json(Path(name))["ours"] for name in ("before.json", "after.json"))
+    assert after["per_seed"] == before["per_seed"]
+    assert report.main(["old", "run", "--no-animation", "--out", "old.html"]) == 0
+    page = Path("old.html").read_text()
+    assert "<tr><td>bc_epochs</td><td>200</td><td>-</td></tr>" in page
+    assert "<tr><td>cloning_updates</td><td>-</td><td>0</td></tr>" in page
+    assert figures.read_curve(Path("old")).iteration == "passes over the demonstrations"
+    assert figures.read_curve(Path("run")).iteration == "iterations of 100 gradient steps"
+    capsys.readouterr()
+    assert "old: written with bc_epochs 200 by an earlier version: bc now counts" in refused(
+        capsys, train, "--resume", "--out", "old"
+    )
 
 
 def test_a_run_whose_method_is_not_found_is_not_called_damaged(

@@ -51,7 +51,8 @@ def sample(
     Zero noise gives the mode (that of the Gaussian before it is squashed).
     """
     if isinstance(distribution, CensoredGaussian):
-        return jnp.clip(sample(distribution.gaussian, noise), distribution.low, distribution.high)
+        raw = sample(distribution.gaussian, noise)
+        return jnp.clip(raw, _wide(distribution.low, raw), _wide(distribution.high, raw))
     if isinstance(distribution, TanhGaussian):
         unit = jnp.tanh(sample(distribution.gaussian, noise))
         return _wide(distribution.center, unit) + _wide(distribution.half_range, unit) * unit

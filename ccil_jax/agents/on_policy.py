@@ -314,7 +314,7 @@ def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Bat
 
     reward_advantage, cost_advantage = advantage[REWARD], advantage[COST]
     reward_advantage = (reward_advantage - jnp.mean(reward_advantage)) / (jnp.std(reward_advantage) + 1e-8)
-    if config.standardize_cost_advantage:
+    if config.standardize_cost_advantage and config.reads("standardize_cost_advantage"):
         cost_advantage = (cost_advantage - jnp.mean(cost_advantage)) / (jnp.std(cost_advantage) + 1e-8)
     episodes = episodes_of_steps(transition, parts.limit, parts.env.max_episode_steps)
     batch = Batch(

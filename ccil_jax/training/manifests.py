@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ccil_jax import earlier_versions
 from ccil_jax.config import Config, unused
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.errors import CheckpointError
@@ -134,7 +135,8 @@ def read(folder: Path) -> dict[str, Any]:
 def check_identity(folder: Path, manifest: Mapping[str, Any], identity: Identity | None, free: frozenset[str]) -> None:
     """Raises `CheckpointError` if the step is of another training than `identity`.
 
-    Fields of configurations that are in `free`, or that the method does not use, may differ.
+    Fields of configurations that are in `free`, or that the method does not use, may differ. A field that the step does
+    not name is newer than the step, and counts as its default, see `earlier_versions`.
     """
     saved = manifest.get("identity") or _identity_of_older(manifest)
     if identity is None or saved is None:
@@ -145,8 +147,11 @@ def check_identity(folder: Path, manifest: Mapping[str, Any], identity: Identity
             raise _other(folder, name, saved[name], now[name])
     if saved.get("num_seeds") is not None and len(saved["configs"]) != len(now["configs"]):
         raise _other(folder, "number of configurations", len(saved["configs"]), len(now["configs"]))
-    for config, before, after in zip(identity.configs, saved["configs"], now["configs"], strict=False):
+    for config, named, after in zip(identity.configs, saved["configs"], now["configs"], strict=False):
+        before = _plain(dataclasses.asdict(Config())) | earlier_versions.without_unread(named, config.row)
         for name in sorted((before.keys() | after.keys()) - free - set(unused(config))):
+            if name in earlier_versions.GONE:
+                raise CheckpointError(f"{folder}: {earlier_versions.refusal(name, before[name])}")
             if before.get(name) != after.get(name):
                 raise _other(folder, name, before.get(name), after.get(name))
 

@@ -15,6 +15,7 @@ from ccil_jax.agents.build import resolve
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config, field_names
 from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.earlier_versions import GONE
 from ccil_jax.errors import CheckpointError, ConfigError
 from ccil_jax.training import filesystem, loop
 from ccil_jax.training.checkpointing import Checkpointer
@@ -313,9 +314,10 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
         CheckpointError: there is no intact checkpoint, or it is another training's.
     """
     config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
-    # Traced fields do not matter for acting, and the cost limit may not be known without the demonstrations.
-    identity = Identity(configs=(config,), num_seeds=num_seeds)
-    with Checkpointer(checkpoint_dir, identity, free=frozenset(field_names(traced=True)), readonly=True) as checkpoints:
+    # Traced fields do not matter for acting, and the cost limit may not be known without the demonstrations. Nor does
+    # it matter how an earlier version counted the length of a training.
+    identity, free = Identity(configs=(config,), num_seeds=num_seeds), frozenset({*field_names(traced=True), *GONE})
+    with Checkpointer(checkpoint_dir, identity, free=free, readonly=True) as checkpoints:
         step = checkpoints.latest_step()
         if step is None:
             raise CheckpointError(f"{checkpoint_dir}: holds no finished checkpoint; train first, or continue the run")

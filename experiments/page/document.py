@@ -1,6 +1,5 @@
 """The HTML document of a report: curves, tables of metrics, every seed, and how the runs differ."""
 
-import dataclasses
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -8,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ccil_jax.config import relevant
+from ccil_jax.earlier_versions import GONE
+from experiments.cli.options import CONFIG_FIELDS
 from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number
 from experiments.page.entries import Entry, choose_seed
 from experiments.policies.numpy_policy import is_known
@@ -192,8 +192,8 @@ def _marked(text: str, name: str, beyond_error: bool | None) -> str:
 
 
 def _differences(entries: Sequence[Entry]) -> str:
-    fields = [relevant(e.run.config) for e in entries]  # a run without a field shows a dash
-    names = [name for name in dataclasses.asdict(entries[0].run.config) if any(name in f for f in fields)]
+    fields = [e.run.settings for e in entries]  # a run without a field shows a dash
+    names = [name for name in (*CONFIG_FIELDS, *GONE) if any(name in f for f in fields)]
     differing = [name for name in names if len({repr(f.get(name, "-")) for f in fields}) > 1]
     rows = [[_text(name), *(_text(str(f.get(name, "-"))) for f in fields)] for name in differing]
     text = _table(["field", *(_text(e.label) for e in entries)], rows) if rows else "<p>All fields are equal.</p>"

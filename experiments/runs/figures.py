@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ccil_jax.config import CLONING_UPDATES_PER_ITERATION
 from experiments.cli.names import safe_name
 from experiments.runs import run_folder
 from experiments.runs.intervals import known_deviation, known_mean
@@ -60,9 +61,11 @@ class Curve:
     cost_limit: float | None
     expert_errors: Mapping[str, float | None] = dataclasses.field(default_factory=dict)  # their standard errors
 
+    iteration: str = f"iterations of {CLONING_UPDATES_PER_ITERATION} gradient steps"  # where it takes no step of a task
+
     @property
     def steps_per_iteration(self) -> int:
-        """Environment steps that an iteration takes; 0 where it is a pass over the demonstrations."""
+        """Environment steps that an iteration takes; 0 for behaviour cloning."""
         return int(self.metrics["env_steps"][0, 0])
 
     @property
@@ -88,6 +91,7 @@ def read_curve(folder: Path, label: str | None = None) -> Curve:
             name: run.facts.get(f"{level}_standard_error")  # earlier versions do not say
             for name, level in (("episode_return", "expert_return"), ("episode_cost", "expert_cost"))
         },
+        **({"iteration": "passes over the demonstrations"} if "bc_epochs" in run.gone else {}),
     )
 
 
@@ -106,12 +110,12 @@ def draw_run(folder: Path) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class Panel:
-    """One metric, of the runs that have it and that count on the same axis (environment steps, or passes)."""
+    """One metric, of the runs that have it and that count on the same axis."""
 
     metric: str
     title: str
     curves: Mapping[int, Curve]  # by their index among all curves, which decides on the colour
-    by_passes: bool  # whether the axis counts passes over the demonstrations; otherwise it counts environment steps
+    cloning: bool  # whether the axis counts iterations of behaviour cloning; otherwise it counts environment steps
 
 
 def panels_of(curves: Sequence[Curve]) -> list[Panel]:
@@ -124,12 +128,12 @@ def panels_of(curves: Sequence[Curve]) -> list[Panel]:
     others = dict.fromkeys(name for metrics in strange for name in metrics if name != "env_steps")
     found = []
     for metric, title in (*usual, *((name, name) for name in others)):
-        for by_passes in (False, True):
+        for cloning in (False, True):
             own = {
-                i: c for i, c in enumerate(curves) if metric in c.metrics and (c.steps_per_iteration == 0) is by_passes
+                i: c for i, c in enumerate(curves) if metric in c.metrics and (c.steps_per_iteration == 0) is cloning
             }
             if own:
-                found.append(Panel(metric, title, own, by_passes))
+                found.append(Panel(metric, title, own, cloning))
     return found
 
 
@@ -181,8 +185,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Any]:
     }
     entries |= _draw_levels(axes, list(panel.curves.values()), panel.metric)
     axes.set_title(literal(panel.title))
-    if panel.by_passes:
-        axes.set_xlabel("passes over the demonstrations")
+    if panel.cloning:
+        axes.set_xlabel(" or ".join(dict.fromkeys(curve.iteration for curve in panel.curves.values())))
     else:
         axes.set_xlabel(f"iterations of {min(steps):,} steps" if len(steps) == 1 else "environment steps per seed")
     return entries

@@ -120,7 +120,7 @@ class MetricsWriter:
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
 
-        # Behaviour cloning takes no environment steps; its axis is the number of passes over the demonstrations.
+        # Behaviour cloning takes no environment steps; its axis is the number of iterations.
         steps = int(row[0, self._names.index("env_steps")]) or iteration
         means = known_mean(row, axis=0)
         values = [

@@ -30,6 +30,7 @@ def resumed(
     if not (folder / "config.json").is_file():
         raise UsageError(f"--resume: {folder} holds no run (no config.json); leave --resume out or correct {option}")
     run = run_folder.read_run(folder)
+    run_folder.check_continues(run, f"--resume: {folder}")
     demos = run.facts["demonstrations"]
     saved = {
         **relevant(run.config),

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ccil_jax.config import Config, check_types
+from ccil_jax import earlier_versions
+from ccil_jax.config import Config, check_types, relevant
 from ccil_jax.errors import ConfigError
 from ccil_jax.methods import find_method
 from ccil_jax.training.versions import versions
@@ -67,6 +68,13 @@ class Run:
     folder: Path
     config: Config
     facts: dict[str, Any]  # task, physics, env_options, seeds, demonstrations, ...
+    gone: Mapping[str, Any]  # fields that `Config` no longer has, of an earlier version's run
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The fields that tell this run from another, by name; see `relevant`."""
+        unset = {earlier_versions.GONE[name].instead for name in self.gone}
+        return {name: value for name, value in relevant(self.config).items() if name not in unset} | {**self.gone}
 
 
 def read_run(folder: Path) -> Run:
@@ -77,6 +85,8 @@ def read_run(folder: Path) -> Run:
 
 def parse_run(path: Path, facts: dict[str, Any]) -> Run:
     """The run that the content of a config.json describes.
+
+    Runs of earlier versions are read too. What they do not say has its default, which is what these versions did.
 
     Args:
         path: of the file that has the content; its folder is that of the run.
@@ -89,23 +99,33 @@ def parse_run(path: Path, facts: dict[str, Any]) -> Run:
     names = {f.name for f in dataclasses.fields(Config)}
     if not isinstance(fields, dict) or not _FACTS.issubset(facts):
         raise UsageError(f"{path}: keys are missing; give a folder that this version's `train` or `expert` wrote")
-    if unknown := sorted(set(fields) - names):
+    if unknown := sorted(set(fields) - names - earlier_versions.GONE.keys()):
         raise UsageError(f"{path}: field '{unknown[0]}' is not known to this version; use the version that wrote it")
     task = TASKS.get(str(facts["task"]))
     if task:  # an earlier version wrote options that make no difference to these tasks
         known = {*task.options, "max_episode_steps"}
         facts["env_options"] = {name: value for name, value in facts["env_options"].items() if name in known}
     values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+    gone = {name: values.pop(name) for name in earlier_versions.GONE if name in values}
     config = Config(**values)
     try:
-        find_method(config.method)
+        gone = earlier_versions.without_unread(gone, find_method(config.method))
     except ConfigError as error:  # one of the user's own, whose module is not found from here, is no damage
         raise UsageError(f"{path}: {error.on_command_line()}") from None
     try:
         check_types(config)
     except ConfigError as error:
         raise UsageError(f"{path}: {error}; the run folder is damaged, restore or repeat the run") from None
-    return Run(path.parent, config, facts)
+    return Run(path.parent, config, facts, gone)
+
+
+def check_continues(run: Run, option: str) -> None:
+    """Raises `UsageError`, which begins with `option`, where this version would train a run in another way.
+
+    Such a run of an earlier version can still be evaluated and reported.
+    """
+    for name, value in run.gone.items():
+        raise UsageError(f"{option}: {earlier_versions.refusal(name, value)}")
 
 
 def task_of(run: Run) -> TaskInfo:

@@ -105,6 +105,7 @@ def check_unchanged(variant: Variant) -> None:
     if not plan.resume:
         return
     run = run_folder.read_run(plan.folder)
+    run_folder.check_continues(run, f"--resume: {plan.folder}")
     names = ("task", "seed", "num_seeds", "eval_episodes", "env_options", "one_by_one")
     chosen = {**relevant(plan.config), **{name: getattr(setup, name) for name in names}}
     saved = {**run.facts, **dataclasses.asdict(run.config)}
