@@ -132,12 +132,9 @@ def unless(
 def _weights(
     config: Config, constraint: Constraint, multiplier: jax.Array, step_gap: jax.Array, gram: jax.Array
 ) -> jax.Array:
-    """Of the objectives in the step: the constraint's for reward and cost, and that of the demonstrations, if any.
-
-    The demonstrations keep their share of the step, however large the multiplier is.
-    """
+    """Of the objectives in the step: the constraint's for reward and cost, and that of the demonstrations, if any."""
     weights = constraint.combine(multiplier, step_gap, gram[:2, :2])
-    return weights if len(gram) == 2 else jnp.append(weights, config.cloning_weight * jnp.sum(jnp.abs(weights)))
+    return weights if len(gram) == 2 else jnp.append(weights, config.cloning_weight)
 
 
 def outer_problem(
