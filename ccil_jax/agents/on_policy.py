@@ -67,9 +67,7 @@ class Parts(NamedTuple):
     constraint: Constraint
     optimizer: Optimizer  # of the critics
     expert: ExpertData | None = None
-    clone: Agent | None = (
-        None  # clones the first policy from the demonstrations; None where training begins from nought
-    )
+    clone: Agent | None = None  # learns the first policy by behaviour cloning
 
     @property
     def limit(self) -> jax.Array:
@@ -93,8 +91,8 @@ def make_parts(
     own = networks.policy_of(config, env) if policy is None else policy
     policy = contracts.policy(own, env.action_dim)
     clone = None
-    if config.reads("cloning_updates") and config.cloning_updates:
-        clone = behavior_cloning.make(config, env, expert, policy=own)
+    if config.cloning_updates:
+        clone = behavior_cloning.make(config, env, expert, policy=own, optimizer=optimizer)
     if config.action_likelihood == "censored":
         policy = networks.censored(policy, env)
     return Parts(
@@ -126,7 +124,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None, **own: obj
 
 
 def init(parts: Parts, key: jax.Array) -> AgentState:
-    """An untrained agent whose simulations have begun. The key is consumed."""
+    """An agent before its first iteration, whose simulations have begun. The key is consumed."""
     config, env = parts.config, parts.env
     key, policy_key, critic_key, reward_key, env_key = jax.random.split(key, 5)
     critic_params = jax.vmap(parts.critic.init)(jax.random.split(critic_key, 2))
