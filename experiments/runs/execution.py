@@ -88,10 +88,10 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         for plan, result in trained:
             for seed in np.flatnonzero(result.stopped):
                 display.message(f"seed {seed} stopped: {fault_files.write(plan.folder, result, int(seed))}")
-            for at_largest in _at_largest_multiplier(result):
+            for capped in _at_largest_multiplier(result):
                 display.message(
-                    f"seed {at_largest}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, and the "
-                    "cost is still above its limit: it does not follow the multiplier"
+                    f"seed {capped}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, with the "
+                    "cost above its limit: the cost does not follow it"
                 )
         display.message(f"evaluating {setup.eval_episodes} episodes per seed ...")
         evaluations, random = _evaluate(setup, [result for _, result in trained], env)
