@@ -90,8 +90,8 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
                 display.message(f"seed {seed} stopped: {fault_files.write(plan.folder, result, int(seed))}")
             for capped in _at_largest_multiplier(result):
                 display.message(
-                    f"seed {capped}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, with the "
-                    "cost above its limit: the cost does not follow it"
+                    f"seed {capped}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, and "
+                    "the cost above its limit: the cost does not follow it"
                 )
         display.message(f"evaluating {setup.eval_episodes} episodes per seed ...")
         evaluations, random = _evaluate(setup, [result for _, result in trained], env)
