@@ -537,7 +537,7 @@ def _check_method(config: Config) -> None:
         )
     if LAGRANGIAN_LOSS.holds(config) and config.meta_gradient == "direct":
         raise ConfigError(
-            "--meta-gradient direct: the lagrangian outer loss depends on the multiplier through the policy alone; use "
+            "--meta_gradient direct: the lagrangian outer loss depends on the multiplier through the policy alone; use "
             "full"
         )
     if META.holds(config) and config.num_held_out == 0:

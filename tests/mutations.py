@@ -177,6 +177,34 @@ MUTATIONS = (
         "better = held_out <= jnp.inf",
         ("tests/test_behavior_cloning.py",),
     ),
+    Mutation(
+        "an action at a bound has the density of one inside",
+        "ccil_jax/acting/distributions.py",
+        "at_bound = (action <= low) | (action >= high)",
+        "at_bound = (action < low) | (action > high)",
+        ("tests/test_distributions.py",),
+    ),
+    Mutation(
+        "the clone moves while it should be held",
+        "ccil_jax/agents/on_policy.py",
+        "warming_up = state.iteration < config.warmup_iterations",
+        "warming_up = state.iteration < 0",
+        ("tests/test_cloning.py",),
+    ),
+    Mutation(
+        "a replayed step leaves the demonstrations out",
+        "ccil_jax/learning/policy_step.py",
+        "weights = _weights(config, constraint, multiplier, taken.step_gap, taken.directions.gram)",
+        "weights = _weights(config, constraint, multiplier, taken.step_gap, taken.directions.gram).at[2:].set(0.0)",
+        ("tests/test_cloning.py",),
+    ),
+    Mutation(
+        "the cost counts as a reward in the Lagrangian outer loss",
+        "ccil_jax/learning/constraints.py",
+        "reward_advantage - weight * cost_advantage",
+        "reward_advantage + weight * cost_advantage",
+        ("tests/test_meta_gradient.py",),
+    ),
 )
 
 

@@ -55,6 +55,25 @@ def test_it_finds_the_mean_and_the_deviation_of_a_gaussian_expert() -> None:
     assert not result.metrics["env_steps"].any()
 
 
+def test_from_executed_actions_it_finds_the_gaussian_that_was_clipped() -> None:
+    """Actions of N(0.2 + 2 SLOPE . obs, (2 STD)^2), clipped to [-1, 1]. Those at a bound would mislead a density."""
+    demonstrations = linear_expert(4000)
+    demonstrations = dataclasses.replace(demonstrations, actions=np.clip(2 * demonstrations.actions, -1, 1))
+    assert 0.2 < np.mean(np.abs(demonstrations.actions) == 1) < 0.6
+    truth, error, deviation = 0.2 + 2 * demonstrations.obs @ SLOPE, {}, {}
+    common = np.abs(demonstrations.obs).max(axis=1) < 1.5
+    for likelihood in ("censored", "gaussian"):
+        result = clone(demonstrations, cloning_updates=4_500, actor_learning_rate=3e-3, action_likelihood=likelihood)
+        actor = jax.tree.map(lambda leaf: leaf[0], result.actor)
+        obs = normalize(actor.obs_statistics, jnp.asarray(demonstrations.obs))
+        mean, log_std = numpy_policy(actor.policy_params, obs)
+        error[likelihood] = np.sqrt(np.mean((mean[:, 0] - truth)[common] ** 2))
+        deviation[likelihood] = np.exp(log_std).item()
+    assert error["censored"] < 0.1 < 2 * 0.1 < error["gaussian"]
+    np.testing.assert_allclose(deviation["censored"], 2 * STD, rtol=0.1)
+    assert deviation["gaussian"] < 0.8 * 2 * STD
+
+
 def test_what_acts_was_best_on_the_held_out_steps() -> None:
     """30 noisy samples are learnt by heart: the held-out loss turns, and the parameters of its lowest point stay."""
     demonstrations = linear_expert(30)

@@ -1,6 +1,7 @@
 """How the cost enters: dual steps, the gates of CVAG, and the entropy bonus."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from ccil_jax.agents.build import AGENTS
-from ccil_jax.config import Config
+from ccil_jax.config import Config, validate
+from ccil_jax.errors import ConfigError
 from ccil_jax.learning import constraints, policy_step
 from ccil_jax.learning.constraints import EpisodeCosts
 from ccil_jax.methods import METHODS
@@ -35,6 +37,21 @@ def test_sgd_is_projected_ascent_on_the_cost_gap() -> None:
     gaps = [10.0, -4.0, -100.0, 2.0, 1000.0, -20.0]
     #        1.5   1.3    0 (projected)  0.1  3 (capped)  2
     np.testing.assert_allclose(ascend(config, gaps), [1.5, 1.3, 0.0, 0.1, 3.0, 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("limit", "unit"), [(20.0, 20.0), (1.0, 1.0), (0.25, 1.0), (0.0, 1.0)])
+def test_in_units_of_the_limit_a_gap_moves_the_multiplier_alike_on_every_task(limit: float, unit: float) -> None:
+    """lambda + rate (J - J_E) / max(J_E, 1), to the last bit; on the cost's own scale where nothing is said."""
+    fields: dict[str, Any] = {"multiplier_update": "sgd", "initial_multiplier": 0.5, "cost_limit": limit}
+    rate, start = np.float32(0.3), np.float32(0.5)
+    for gap in (7.0, -0.7):
+        config = Config(**fields, multiplier_learning_rate=0.3, gap_unit="limit")
+        assert ascend(config, [gap]) == [start + rate * (np.float32(gap) / np.float32(unit))]
+        (plain,) = ascend(config.replace(gap_unit="cost", multiplier_learning_rate=0.01), [gap])
+        assert plain == start + np.float32(0.01) * np.float32(gap)
+    for update in ("adam", "pid"):
+        with pytest.raises(ConfigError, match=r"gap_unit limit: makes no difference .*whose multiplier_update is sgd"):
+            validate(Config(method="ccil", gap_unit="limit", multiplier_update=update))
 
 
 def adam_on_softplus(initial: float, rate: float, gaps: list[float]) -> list[float]:

@@ -14,6 +14,7 @@ from ccil_jax.acting import distributions
 from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
 from ccil_jax.agents import build, on_policy
 from ccil_jax.agents.expert import expert_data
+from ccil_jax.types import Transition
 from envs.base import State
 from envs.jax_tools import full_precision
 from tests.probe_envs import Probe, assert_same_bits, same_bits, walk_config, walk_demonstrations
@@ -344,11 +345,16 @@ def test_a_censored_policy_records_the_actions_that_the_task_executes(likelihood
         walk_config(method="ccil", action_likelihood=likelihood, batch_size=400), env, demonstrations
     )
     parts = on_policy.make_parts(config, env, expert_data(demonstrations))
-    state = on_policy.init(parts, jax.random.key(0))
-    one = jax.jit(full_precision(lambda state: on_policy.generator_step(parts, state, jax.random.key(1))))
-    _, last, _ = one(state)
-    given, executed = (np.asarray(x)[..., 0] for x in (last.transition.next_obs, last.transition.reward[..., None]))
-    recorded = np.asarray(last.transition.action)[..., 0]
+
+    @jax.jit
+    @full_precision
+    def one() -> Transition:
+        state = on_policy.init(parts, jax.random.key(0))
+        return on_policy.generator_step(parts, state, jax.random.key(1))[1].transition
+
+    transition = one()
+    given, executed = (np.asarray(x)[..., 0] for x in (transition.next_obs, transition.reward[..., None]))
+    recorded = np.asarray(transition.action)[..., 0]
     np.testing.assert_array_equal(recorded, given)
     assert executed.min() == -0.5
     assert executed.max() == 0.5

@@ -1,5 +1,6 @@
 """MALM's outer step: the derivative of the inner policy step, and of the held-out loss through it."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,10 +12,11 @@ from jax.flatten_util import ravel_pytree
 from ccil_jax.acting import networks, running_statistics
 from ccil_jax.agents import build, on_policy
 from ccil_jax.agents.expert import expert_data
-from ccil_jax.config import Config
+from ccil_jax.config import Config, validate
+from ccil_jax.errors import ConfigError
 from ccil_jax.learning import constraints, policy_step, reward_models, trust_region
 from ccil_jax.learning.constraints import Multiplier, Outer
-from ccil_jax.learning.policy_step import PolicyStep
+from ccil_jax.learning.policy_step import ExpertSteps, PolicyStep
 from ccil_jax.learning.reward_models import RewardModel
 from ccil_jax.learning.trust_region import Directions
 from ccil_jax.types import Batch, PyTree
@@ -36,7 +38,7 @@ STEP = 1e-5  # of the central differences: their error is about STEP^2 + 1e-16 /
 class Learner:
     """The inner step and the outer gradient of random problems, each compiled once. Use within float64."""
 
-    def __init__(self, **changes: Any) -> None:
+    def __init__(self, expert: ExpertSteps | None = None, **changes: Any) -> None:
         template = policy_problem(0, np.float64, **changes)
         config, apply = template.config, template.policy.apply
         constraint = constraints.meta_lagrangian(config)
@@ -46,13 +48,18 @@ class Learner:
             params: PyTree, training: Batch, held_out: Batch, multiplier: jax.Array, kl_tolerance: jax.Array
         ) -> tuple[PyTree, PolicyStep]:
             changed = config.replace(kl_tolerance=kl_tolerance)
-            gap = jnp.zeros(())
-            return policy_step.improve(changed, apply, constraint, params, training, multiplier, gap, held_out)[:2]
+            arguments = (changed, apply, constraint, params, training, multiplier, jnp.zeros(()), held_out)
+            return policy_step.improve(*arguments, expert)[:2]
 
         @jax.jit
         def gradients(taken: PolicyStep, multiplier: jax.Array, after_dual: jax.Array) -> list[jax.Array]:
             outer = policy_step.outer_problem(config, apply, constraint, taken)
             return [constraints.outer_gradient(kind, multiplier, after_dual, outer) for kind in KINDS]
+
+        @jax.jit
+        def lagrangian(taken: PolicyStep, multiplier: jax.Array, weight: jax.Array) -> jax.Array:
+            outer = policy_step.outer_problem(config, apply, constraint, taken)
+            return constraints.lagrangian_gradient(multiplier, weight, outer)
 
         @jax.jit
         def step_derivative(taken: PolicyStep, multiplier: jax.Array) -> jax.Array:
@@ -63,7 +70,8 @@ class Learner:
 
             return jax.jvp(replay, (multiplier,), (jnp.ones_like(multiplier),))[1]
 
-        self._improve, self._gradients, self.step_derivative = improve, gradients, step_derivative
+        self._improve, self._gradients, self._lagrangian = improve, gradients, lagrangian
+        self.step_derivative = step_derivative
 
     def improve(self, problem: PolicyProblem, multiplier: float, kl_tolerance: float) -> tuple[PyTree, PolicyStep]:
         """The step actually taken."""
@@ -74,6 +82,10 @@ class Learner:
         """The outer gradient of every kind."""
         found = self._gradients(taken, jnp.asarray(multiplier), jnp.asarray(after_dual))
         return {kind: float(value) for kind, value in zip(KINDS, found, strict=True)}
+
+    def lagrangian_gradient(self, taken: PolicyStep, multiplier: float, weight: float) -> float:
+        """That of the outer loss `lagrangian`."""
+        return float(self._lagrangian(taken, jnp.asarray(multiplier), jnp.asarray(weight)))
 
 
 @pytest.fixture(scope="module")
@@ -205,6 +217,149 @@ def test_cancelling_directions_have_a_finite_derivative() -> None:
         return trust_region.propose(jnp.zeros(2), along, weights, 0.01, 1.0)
 
     assert np.all(jax.jacfwd(step)(jnp.ones(())) == 0)
+
+
+# The Lagrangian as outer loss ----------------------------------------------------------------------------------------
+
+
+def numpy_lagrangian(problem: PolicyProblem, new_params: PyTree, weight: float) -> float:
+    """-mean w (A_r - weight A_c) in NumPy, on the held-out samples, from the parameters of a step that was taken."""
+    held_out = problem.held_out
+    weights = np.exp(numpy_log_prob(new_params, held_out) - numpy_log_prob(problem.params, held_out))
+    gain = np.asarray(held_out.reward_advantage) - weight * np.asarray(held_out.cost_advantage)
+    return -float(np.mean(weights * gain))
+
+
+def test_the_lagrangian_loss_by_hand() -> None:
+    """w (A_r - 2 A_c) is 1 (3 - 2) = 1 and 2 (-1 - 1) = -4: mean -1.5."""
+    columns = (jnp.array([1.0, 2.0]), jnp.array([3.0, -1.0]), jnp.array([1.0, 0.5]))
+    np.testing.assert_allclose(constraints.lagrangian_loss(*columns, jnp.asarray(2.0)), 1.5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("cloning_weight", [None, 0.4])
+def test_the_lagrangian_gradient_is_the_central_difference_of_the_loss_of_the_step_taken(
+    cloning_weight: float | None,
+) -> None:
+    """Through the policy step itself, also where the demonstrations take part in it."""
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(7)
+        obs, action = (jnp.asarray(rng.normal(size=(40, size))) for size in (3, 2))
+        expert = None if cloning_weight is None else ExpertSteps(obs=obs, action=action)
+        learner = Learner(expert, cloning_weight=cloning_weight or 0.0)
+        for seed, multiplier, kl_tolerance, fraction in CASES:
+            problem = policy_problem(seed, np.float64)
+            taken = learner.improve(problem, multiplier, kl_tolerance)[1]
+            assert taken.fraction == fraction
+            moved = [learner.improve(problem, multiplier + s * STEP, kl_tolerance)[0] for s in (1, -1)]
+            for weight in (0.0, multiplier + 0.5):
+                up, down = (numpy_lagrangian(problem, params, weight) for params in moved)
+                found = learner.lagrangian_gradient(taken, multiplier, weight)
+                np.testing.assert_allclose(found, (up - down) / (2 * STEP), rtol=1e-6, atol=1e-9)
+                assert abs(found) > 1e-4  # there is something to find
+
+
+def test_on_the_samples_of_the_step_the_lagrangian_gradient_leads_to_the_weight() -> None:
+    """It has the sign of lambda - weight, and vanishes where they are equal: such a step is the best for that weight.
+
+    That holds for an exact step that is so small that the surrogates are linear. What is left is of the order of
+    sqrt(max_kl) = 1e-7 and of what conjugate gradients leave, 1e-5, beside the gradient elsewhere.
+    """
+    with jax.enable_x64(True):
+        learner = Learner(cg_iterations=80, fisher_stride=1, max_kl=1e-14)
+        for seed, weight in ((0, 0.6), (1, 2.0), (2, 0.05)):
+            problem = policy_problem(seed, np.float64)
+            problem = dataclasses.replace(problem, held_out=problem.training)
+            found = {}
+            for multiplier in (0.2 * weight, 0.9 * weight, weight, 1.1 * weight, 5.0 * weight):
+                taken = learner.improve(problem, multiplier, 1.5)[1]
+                assert taken.fraction == 1.0
+                found[multiplier - weight] = learner.lagrangian_gradient(taken, multiplier, weight)
+            for distance, gradient in found.items():
+                if distance == 0:
+                    assert abs(gradient) < 1e-3 * min(abs(other) for other in found.values() if other != gradient)
+                else:
+                    assert gradient * distance > 0
+            assert max(abs(gradient) for gradient in found.values()) > 1e-10  # steps have a length of about 1e-7
+
+
+def test_where_the_cost_does_not_change_the_lagrangian_gradient_is_0(learner: Learner) -> None:
+    """Without cost advantages no step depends on lambda; nor does one that was rejected."""
+    with jax.enable_x64(True):
+        problem = policy_problem(1, np.float64)
+        free = problem.training.replace(cost_advantage=jnp.zeros_like(problem.training.cost_advantage))
+        taken = learner.improve(dataclasses.replace(problem, training=free), 0.8, 1.5)[1]
+        assert taken.fraction == 1.0
+        assert learner.lagrangian_gradient(taken, 0.8, 3.0) == 0.0
+        rejected = learner.improve(problem, 0.8, 0.0)[1]
+        assert rejected.fraction == 0.0
+        assert learner.lagrangian_gradient(rejected, 0.8, 3.0) == 0.0
+
+
+LAGRANGIAN = Config(
+    outer_loss="lagrangian",
+    multiplier_update="sgd",
+    multiplier_learning_rate=0.05,
+    meta_update="sgd",
+    meta_learning_rate=0.25,
+    outer_penalty=1.5,
+    cost_limit=10.0,
+)
+
+
+def squared_weights() -> Outer:
+    """An outer problem whose importance weights are lambda^2, so that their slope at lambda = 1 is 2."""
+    return dataclasses.replace(constant_weights(1.0), importance_weights=lambda multiplier: multiplier**2 * jnp.ones(4))
+
+
+@pytest.mark.parametrize(
+    ("gap", "limit", "weight"),
+    [
+        (2.0, 10.0, 1.1 + 1.5 * 2.0 / 10.0),  # lambda' = 1 + 0.05 * 2
+        (-4.0, 10.0, 0.8 - 1.5 * 4.0 / 10.0),
+        (-9.0, 10.0, 0.0),  # 0.55 - 1.35 is below 0
+        (0.5, 0.25, 1.025 + 1.5 * 0.5),  # a limit below 1 is no unit
+        (0.5, 0.0, 1.025 + 1.5 * 0.5),
+    ],
+)
+def test_the_outer_step_of_the_lagrangian_by_hand(gap: float, limit: float, weight: float) -> None:
+    """dL/dlambda = -2 mean(A_r - weight A_c) at lambda = 1, from where the inner step was taken, not at lambda'."""
+    gradient = -2 * np.mean(REWARD - weight * COST_ADVANTAGE)
+    multiplier, metrics = meta_step(LAGRANGIAN.replace(cost_limit=limit), 1.0, gap, squared_weights())
+    np.testing.assert_allclose(metrics["meta_gradient"], gradient, rtol=1e-5)
+    np.testing.assert_allclose(multiplier, 1 + 0.05 * gap - 0.25 * gradient, rtol=1e-5)
+
+
+def test_in_units_of_the_limit_the_weight_follows_the_dual_step() -> None:
+    """lambda' = 1 + 0.05 * 2 / 10 = 1.01, weight 1.01 + 1.5 * 0.2 = 1.31."""
+    multiplier, metrics = meta_step(LAGRANGIAN.replace(gap_unit="limit"), 1.0, 2.0, squared_weights())
+    gradient = -2 * np.mean(REWARD - 1.31 * COST_ADVANTAGE)
+    np.testing.assert_allclose(metrics["meta_gradient"], gradient, rtol=1e-5)
+    np.testing.assert_allclose(multiplier, 1.01 - 0.25 * gradient, rtol=1e-5)
+
+
+def test_a_non_finite_gradient_of_the_lagrangian_moves_nothing() -> None:
+    broken = dataclasses.replace(
+        constant_weights(1.0), importance_weights=lambda multiplier: jnp.nan * multiplier * jnp.ones(4)
+    )
+    multiplier, metrics = meta_step(LAGRANGIAN, 1.0, 2.0, broken)
+    assert metrics["meta_gradient"] == 0
+    np.testing.assert_allclose(multiplier, 1.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"meta_gradient": "direct"}, "meta_gradient direct: the lagrangian outer loss depends on the multiplier thr"),
+        ({"meta_gradient": "none"}, "outer_loss lagrangian: makes no difference to this run of method malm"),
+        ({"method": "ccil"}, "outer_loss lagrangian: makes no difference to this run of method ccil"),
+    ],
+)
+def test_the_lagrangian_loss_is_refused_where_it_cannot_matter(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        validate(Config(outer_loss="lagrangian", **fields))
+    validate(Config(outer_loss="lagrangian"))
+    with pytest.raises(ConfigError, match=r"^outer_penalty 2\.0: makes no difference .*whose outer_loss is lagr"):
+        validate(Config(outer_penalty=2.0))
 
 
 # The outer step ------------------------------------------------------------------------------------------------------
