@@ -91,7 +91,7 @@ def make_parts(
     own = networks.policy_of(config, env) if policy is None else policy
     policy = contracts.policy(own, env.action_dim)
     clone = None
-    if config.cloning_updates:
+    if config.reads("cloning_updates") and config.cloning_updates:
         clone = behavior_cloning.make(config, env, expert, policy=own, optimizer=optimizer)
     if config.action_likelihood == "censored":
         policy = networks.censored(policy, env)
