@@ -535,10 +535,10 @@ def _check_method(config: Config) -> None:
             f"--multiplier_update {config.multiplier_update}: has no parameter for the outer step of {config.method}; "
             "use adam or sgd, or --method ccil"
         )
-    if LAGRANGIAN_LOSS.holds(config) and config.meta_gradient == "direct":
+    if LAGRANGIAN_LOSS.holds(config) and config.meta_gradient != "full":
         raise ConfigError(
-            "--meta_gradient direct: the lagrangian outer loss depends on the multiplier through the policy alone; use "
-            "full"
+            f"--meta_gradient {config.meta_gradient}: the lagrangian outer loss depends on the multiplier through the "
+            "policy alone, so there is nothing to choose; use full, or none"
         )
     if META.holds(config) and config.num_held_out == 0:
         raise ConfigError(

@@ -187,8 +187,9 @@ def lagrangian_gradient(multiplier: Float[Array, ""], weight: Float[Array, ""], 
 
     `weight` is that of the augmented Lagrangian (Hestenes 1969, Powell 1969), max(0, lambda' + rho e) with the relative
     gap e = (J_k - J_E) / J_E. A step along x_r - lambda x_c changes with lambda along -x_c, so on the samples of the
-    step itself the gradient is proportional to lambda - weight: descent takes lambda to a value that weighs the cost as
-    the gap demands. Where no step changes the cost, the gradient is 0 and lambda stays.
+    step itself the gradient is proportional to lambda - weight: descent takes lambda to a value that weighs the cost
+    as the gap demands. Where no step changes the cost, the gradient is 0 and lambda stays. This is exact where the step
+    follows reward and cost alone; the demonstrations' likelihood, where it is an objective too, is not in the loss.
     """
 
     def loss(multiplier: jax.Array) -> jax.Array:

@@ -125,8 +125,8 @@ def unless(
 ) -> tuple[PyTree, PolicyStep, Metrics]:
     """What `improve` returned; where `held` [] is true, as if there had been no step."""
     params = jax.tree.map(lambda old, new: jnp.where(held, old, new), taken.policy_params, policy_params)
-    of_step = {name: jnp.where(held, 0.0, metrics[name]) for name in ("kl", "surrogate", "step_fraction")}
-    return params, dataclasses.replace(taken, fraction=jnp.where(held, 0.0, taken.fraction)), metrics | of_step
+    metrics = {name: value if name == "cost_weight" else jnp.where(held, 0.0, value) for name, value in metrics.items()}
+    return params, dataclasses.replace(taken, fraction=jnp.where(held, 0.0, taken.fraction)), metrics
 
 
 def _weights(

@@ -177,8 +177,9 @@ def discriminator(
 ) -> RewardModel:
     """The adversarial reward of GAIL (Ho and Ermon 2016).
 
-    It judges the learner's actions as they were sampled. Once clipped as the environment executes them, all actions
-    beyond the range would earn alike, and a policy whose mean has left the range would have no way back.
+    It judges the learner's actions as `config.action_likelihood` has them. As they were drawn (gaussian): once clipped,
+    all actions beyond the range would earn alike, and a policy whose mean has left the range would have no way back. Or
+    as they are executed (censored), like the expert's.
     """
     rule = optimizer(config.discriminator_learning_rate)
     if config.discriminator_regularizer == "spectral_norm":
