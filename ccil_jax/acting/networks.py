@@ -95,6 +95,11 @@ def censored(policy: Policy, env: Environment) -> Policy:
     return Policy(policy.init, apply)
 
 
+def with_likelihood(config: Config, env: Environment, policy: Policy) -> Policy:
+    """The policy with the likelihood `config.action_likelihood` of its actions."""
+    return censored(policy, env) if config.action_likelihood == "censored" else policy
+
+
 LOG_STD_RANGE = (-5.0, 2.0)  # of a squashed policy (the published code of IQ-Learn, after pytorch_sac)
 
 

@@ -56,9 +56,8 @@ def make(
 ) -> Agent:
     """Builds the agent; an iteration is `CLONING_UPDATES_PER_ITERATION` gradient steps."""
     assert expert is not None, "bc learns from demonstrations"
-    policy = contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim)
-    if config.action_likelihood == "censored":
-        policy = networks.censored(policy, env)
+    own = contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim)
+    policy = networks.with_likelihood(config, env, own)
     apply, rule = policy.apply, optimizer(config.actor_learning_rate)
     statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
     obs = running_statistics.normalize(statistics, expert.obs)
@@ -87,8 +86,10 @@ def make(
         return (_keep_wide(params), optimizer_state), loss
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
-        key, shuffle_key = jax.random.split(state.key)
-        minibatches = jax.random.randint(shuffle_key, (CLONING_UPDATES_PER_ITERATION, minibatch_size), 0, obs.shape[0])
+        key, minibatch_key = jax.random.split(state.key)
+        minibatches = jax.random.randint(
+            minibatch_key, (CLONING_UPDATES_PER_ITERATION, minibatch_size), 0, obs.shape[0]
+        )
         (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), minibatches)
         held_out = negative_log_likelihood(apply, params, held_out_obs, expert.held_out_action)
         better = held_out < state.held_out_loss

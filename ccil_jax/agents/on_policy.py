@@ -89,16 +89,13 @@ def make_parts(
 ) -> Parts:
     """The parts of the agent of `config.method`; what is given takes the place of the method's own."""
     own = networks.policy_of(config, env) if policy is None else policy
-    policy = contracts.policy(own, env.action_dim)
     clone = None
     if config.reads("cloning_updates") and config.cloning_updates:
         clone = behavior_cloning.make(config, env, expert, policy=own, optimizer=optimizer)
-    if config.action_likelihood == "censored":
-        policy = networks.censored(policy, env)
     return Parts(
         config=config,
         env=env,
-        policy=policy,
+        policy=networks.with_likelihood(config, env, contracts.policy(own, env.action_dim)),
         critic=contracts.critic(networks.make_scalar(config, env.obs_dim) if critic is None else critic),
         reward_model=contracts.reward_model(
             reward_models.make(config, env, expert, optimizer) if reward_model is None else reward_model
