@@ -173,6 +173,12 @@ class Config:
         5, "every n-th sample of the batch enters the products with the Fisher matrix (authors)"
     )
     line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
+    critic_intervals: int = _static(
+        0,
+        "equal intervals into which the range of each observation entry is divided for the critics, which then tell "
+        "apart values that lie close together (piecewise linear encoding, Gorishniy et al. 2022); 0 gives them the "
+        "observations as they are",
+    )
     critic_epochs: int = _static(5, "passes of both critics over each batch (authors)")
     critic_minibatch_size: int = _static(
         128,

@@ -32,6 +32,7 @@ class Fields(TypedDict, total=False):
     cg_iterations: int
     fisher_stride: int
     line_search_steps: int
+    critic_intervals: int
     critic_epochs: int
     critic_minibatch_size: int
     standardize_cost_advantage: bool

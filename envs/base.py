@@ -5,6 +5,7 @@ An environment is a set of pure functions of one simulation; callers `vmap` them
 given. Starting anew is the task of the code that collects episodes (`ccil_jax.acting.rollout`).
 """
 
+import dataclasses
 from collections.abc import Iterable
 from typing import Any, Protocol
 
@@ -127,6 +128,33 @@ class Environment(Protocol):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Advances one control step. `action` is `[action_dim]`; stepping a done state is undefined."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mirror:
+    """A mirror symmetry of a task: a step seen in a mirror is a step of the same task.
+
+    Entry i of a mirrored array is `sign[i]` times entry `index[i]` of the array itself. Doing it twice changes nothing.
+    """
+
+    obs_index: np.ndarray  # [obs_dim] int
+    obs_sign: np.ndarray  # [obs_dim] 1 or -1
+    action_index: np.ndarray  # [action_dim] int
+    action_sign: np.ndarray  # [action_dim] 1 or -1
+
+    def obs(self, obs: Any) -> Any:
+        """Mirrored observations, [..., obs_dim], NumPy's or JAX's as they are given."""
+        return obs[..., self.obs_index] * self.obs_sign.astype(obs.dtype)
+
+    def action(self, action: Any) -> Any:
+        """Mirrored actions, [..., action_dim]."""
+        return action[..., self.action_index] * self.action_sign.astype(action.dtype)
+
+
+def mirror_of(env: Environment) -> Mirror | None:
+    """The mirror symmetry that a task declares as its attribute `mirror`; None where it declares none."""
+    mirror: Mirror | None = getattr(env, "mirror", None)
+    return mirror
 
 
 def check_shape(what: str, array: jax.typing.ArrayLike, expected: tuple[int, ...]) -> None:

@@ -137,7 +137,15 @@ def test_static_fields_that_are_said_to_be_unused_leave_the_program_as_it_is(var
 
 
 # Fields that shape arrays; a method that is said not to use them has no array to shape.
-SIZES = {"num_envs", "batch_size", "generator_steps", "critic_epochs", "fisher_stride", "line_search_steps"}
+SIZES = {
+    "num_envs",
+    "batch_size",
+    "generator_steps",
+    "critic_epochs",
+    "critic_intervals",
+    "fisher_stride",
+    "line_search_steps",
+}
 
 
 @pytest.mark.parametrize("name", OTHER)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ccil_jax.acting import distributions
+from ccil_jax.acting import distributions, running_statistics
 from ccil_jax.acting.distributions import CensoredGaussian, Gaussian, TanhGaussian
 from ccil_jax.config import Config
 from ccil_jax.methods import function_of
@@ -142,6 +142,62 @@ POLICIES: Mapping[str, Callable[[Config, Environment], Policy | SquashedPolicy]]
 def policy_of(config: Config, env: Environment) -> Any:
     """The policy network of `config.method`: a `Policy`, or a `SquashedPolicy`."""
     return function_of(config.row.policy, POLICIES, "policy")(config, env)
+
+
+def piecewise_linear(
+    network: Network, low: Float[Array, " D"], high: Float[Array, " D"], num_intervals: int
+) -> Network:
+    """The network on a piecewise linear encoding of its inputs (Gorishniy, Rubachev and Babenko 2022).
+
+    The range [low, high] of each entry x is divided into K equal intervals with the edges e_0 to e_K. K numbers take
+    the place of x: the i-th is (x - e_i) / (e_i+1 - e_i), clipped to [0, 1]. So a network can tell apart values that
+    lie close together, and bend its function at every edge, which a small network on x itself learns slowly or never.
+    The first number is not clipped at 0 nor the last at 1, so that values outside the range can be told apart too.
+
+    Args:
+        network: takes [..., D K] inputs, the K numbers of each interval side by side.
+        low: lower end of the range of each entry.
+        high: upper end, larger than `low`.
+        num_intervals: K, at least 1.
+
+    Returns:
+        The network of [..., D] inputs.
+    """
+    width = (high - low) / num_intervals
+    edges = low + width * jnp.arange(num_intervals)[:, None]  # [K, D]
+    smallest = jnp.zeros((num_intervals, 1)).at[0].set(-jnp.inf)
+    largest = jnp.ones((num_intervals, 1)).at[-1].set(jnp.inf)
+
+    def apply(params: PyTree, x: Float[Array, "... D"]) -> jax.Array:
+        encoded = jnp.clip((x[..., None, :] - edges) / width, smallest, largest)
+        return network.apply(params, encoded.reshape(*x.shape[:-1], -1))
+
+    return Network(network.init, apply)
+
+
+def make_critic(config: Config, env: Environment, demonstrated: Float[Array, "n D"] | None) -> Network:
+    """A value function of normalised observations, [..., obs_dim] -> [...].
+
+    With `config.critic_intervals` above 0 the observations are encoded, see `piecewise_linear`. The range of each entry
+    is that of the demonstrations once they are normalised, but at least one standard deviation to each side of their
+    mean, so that an entry that never varies in them has a range too. Without demonstrations it is where normalised
+    observations are clipped.
+
+    Args:
+        config: resolved.
+        env: the task.
+        demonstrated: observations of the demonstrations, None where there are none.
+    """
+    if not config.critic_intervals:
+        return make_scalar(config, env.obs_dim)
+    network = make_scalar(config, env.obs_dim * config.critic_intervals)
+    if demonstrated is None:
+        high = jnp.full(env.obs_dim, running_statistics.CLIP)
+        return piecewise_linear(network, -high, high, config.critic_intervals)
+    statistics = running_statistics.update(running_statistics.init(env.obs_dim), demonstrated)
+    normalized = running_statistics.normalize(statistics, demonstrated)
+    low, high = jnp.minimum(jnp.min(normalized, 0), -1.0), jnp.maximum(jnp.max(normalized, 0), 1.0)
+    return piecewise_linear(network, low, high, config.critic_intervals)
 
 
 def make_scalar(config: Config, input_dim: int, final_scale: float = 1.0) -> Network:

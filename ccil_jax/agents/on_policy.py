@@ -89,6 +89,7 @@ def make_parts(
 ) -> Parts:
     """The parts of the agent of `config.method`; what is given takes the place of the method's own."""
     own = networks.policy_of(config, env) if policy is None else policy
+    observed = None if expert is None else expert.obs
     clone = None
     if config.reads("cloning_updates") and config.cloning_updates:
         clone = behavior_cloning.make(config, env, expert, policy=own, optimizer=optimizer)
@@ -96,7 +97,7 @@ def make_parts(
         config=config,
         env=env,
         policy=networks.with_likelihood(config, env, contracts.policy(own, env.action_dim)),
-        critic=contracts.critic(networks.make_scalar(config, env.obs_dim) if critic is None else critic),
+        critic=contracts.critic(networks.make_critic(config, env, observed) if critic is None else critic),
         reward_model=contracts.reward_model(
             reward_models.make(config, env, expert, optimizer) if reward_model is None else reward_model
         ),

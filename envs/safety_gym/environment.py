@@ -15,8 +15,10 @@ from envs.engines import find_engine
 from envs.jax_tools import compute_where
 from envs.physics import Mocap
 from envs.safety_gym import layout as layouts
+from envs.safety_gym import mirror as mirrors
 from envs.safety_gym import scene as scenes
 from envs.safety_gym.lidar import lidar
+from envs.safety_gym.robots import ROBOTS
 from envs.safety_gym.tasks import TABLE
 from envs.safety_gym.terms import AIMS, COSTS, Situation
 
@@ -84,6 +86,10 @@ class SafetyGym:
         self.physics_name = self._physics.name
         hinges, ball = 2 * len(scene.hinge_qpos), 9 * (scene.ball_qpos is not None)
         self.obs_dim = scene.num_observed + hinges + ball + 16 * len(task.lidars)
+        # Gremlins circle to the left. In the mirror they would circle to the right, which is another task.
+        symmetric = not any(kind.circling for kind in task.objects)
+        actuators = [model.actuator(i).name for i in range(model.nu)]
+        self.mirror = mirrors.make(ROBOTS[task.robot], actuators, len(task.lidars)) if symmetric else None
 
     def reset(self, key: jax.Array) -> State:
         """Starts an episode with a layout of its own; `key` is consumed."""

@@ -28,6 +28,9 @@ class Robot:
     sensors: tuple[tuple[str, mujoco.mjtSensor, mujoco.mjtObj, str], ...] = ()  # besides those of every robot
     ball: str | None = None  # the ball joint whose orientation is observed, as a rotation matrix
     hinges: tuple[str, ...] = ()  # the hinges whose angles are observed, as sine and cosine
+    lateral: int = 1  # which of the root body's axes points sideways: 0 is x, 1 is y
+    counterparts: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of sensors, hinges and actuators
+    turning: tuple[str, ...] = ()  # the actuators that turn the robot to the other side in the mirror
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -183,6 +186,13 @@ def _build_doggo(root: mujoco.MjsBody, style: Style) -> None:
 _DOGGO_HINGES = tuple(f"{kind.format(leg)}" for kind in ("hip_{}_z", "hip_{}_y", "ankle_{}") for leg in LEGS)
 
 
+def _doggo_counterparts() -> dict[str, str]:
+    """What belongs to a left leg and what belongs to the right leg at the same end."""
+    names = ("hip_{}_z", "hip_{}_y", "ankle_{}")
+    names = (*names, *(f"velocity_{name}" for name in names), "touch_{}a", "touch_{}b")
+    return {name.format(leg): name.format(LEGS[-1 - i]) for name in names for i, leg in enumerate(LEGS)}
+
+
 def _actuate_doggo(spec: mujoco.MjSpec) -> None:
     for name in _DOGGO_HINGES:
         spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name, gear=[0.00625, 0, 0, 0, 0, 0])
@@ -191,7 +201,15 @@ def _actuate_doggo(spec: mujoco.MjSpec) -> None:
 SENSOR, OBJECT = mujoco.mjtSensor, mujoco.mjtObj
 
 ROBOTS = {
-    "Point": Robot(name="Point", timestep=0.002, height=0.1, planar=True, build=_build_point, actuate=_actuate_point),
+    "Point": Robot(
+        name="Point",
+        timestep=0.002,
+        height=0.1,
+        planar=True,
+        build=_build_point,
+        actuate=_actuate_point,
+        turning=("turn",),
+    ),
     "Car": Robot(
         name="Car",
         timestep=0.004,
@@ -201,6 +219,8 @@ ROBOTS = {
         actuate=_actuate_car,
         sensors=(("rear_velocity", SENSOR.mjSENS_BALLANGVEL, OBJECT.mjOBJ_JOINT, "rear"),),
         ball="rear",
+        lateral=0,
+        counterparts={"left": "right", "right": "left"},
     ),
     "Doggo": Robot(
         name="Doggo",
@@ -219,5 +239,6 @@ ROBOTS = {
             *((f"velocity_{name}", SENSOR.mjSENS_JOINTVEL, OBJECT.mjOBJ_JOINT, name) for name in _DOGGO_HINGES),
         ),
         hinges=_DOGGO_HINGES,
+        counterparts=_doggo_counterparts(),
     ),
 }

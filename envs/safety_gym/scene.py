@@ -31,7 +31,7 @@ PRISM_SIDES = 16
 # round shapes and FLAT for contacts with flat ones, because on MJX it is two geoms.
 FLOOR, ROBOT, MOVABLE, GREMLIN, BALL, ROUND, FLAT = (1 << i for i in range(7))
 
-_BASIC_SENSORS = (
+BASIC_SENSORS = (
     ("accelerometer", SENSOR.mjSENS_ACCELEROMETER),
     ("velocimeter", SENSOR.mjSENS_VELOCIMETER),
     ("gyro", SENSOR.mjSENS_GYRO),
@@ -201,8 +201,8 @@ def _add_object(spec: mujoco.MjSpec, kind: ObjectKind, index: int, prisms: bool)
 
 def _add_sensors(spec: mujoco.MjSpec, robot: Robot) -> int:
     """Adds every robot's sensors, then this robot's own, in the order of the observation; returns how many."""
-    for name, kind in _BASIC_SENSORS:
+    for name, kind in BASIC_SENSORS:
         spec.add_sensor(name=name, type=kind, objtype=OBJECT.mjOBJ_SITE, objname="robot")
     for name, kind, objtype, target in robot.sensors:
         spec.add_sensor(name=name, type=kind, objtype=objtype, objname=target)
-    return len(_BASIC_SENSORS) + len(robot.sensors)
+    return len(BASIC_SENSORS) + len(robot.sensors)

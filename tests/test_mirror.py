@@ -1,0 +1,110 @@
+"""Mirror symmetries that tasks declare, against the physics: a step of the mirrored world is the mirrored step."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+
+import envs
+from envs.base import Mirror, mirror_of
+from envs.safety_gym.environment import SafetyGym
+from envs.safety_gym.robots import ROBOTS
+
+SYMMETRIC = ("PointGoal1", "CarGoal1", "DoggoGoal1", "PointPush1", "CarPush1")
+WORLD = np.array([-1.0, 1.0, 1.0])  # x changes its sign, so that the magnetic field, which points along -y, stays
+HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the vertical, as a quaternion
+JOINT = mujoco.mjtJoint
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    result = np.zeros(4)
+    mujoco.mju_mulQuat(result, np.asarray(a, float), np.asarray(b, float))
+    return result
+
+
+def mirrored_poses(env: SafetyGym, qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Joint by joint. A rotation R becomes M R L: M is the world's mirror, L that of the body, which is its own image.
+
+    L is M too, save for a robot whose y axis points sideways.
+    """
+    robot = ROBOTS[env.task.robot]
+    model, new_qpos, new_qvel = env.model, qpos.copy(), qvel.copy()
+    for joint in (model.joint(i) for i in range(model.njnt)):
+        q, v = joint.qposadr[0], joint.dofadr[0]
+        own = joint.name in ("root", "x", "y", "yaw")
+        body = np.ones(3)
+        body[robot.lateral if own else 0] = -1.0
+        if joint.type[0] == JOINT.mjJNT_FREE:
+            new_qpos[q : q + 3] = WORLD * qpos[q : q + 3]
+            turned = np.array([1, 1, -1, -1]) * qpos[q + 3 : q + 7]  # M R M
+            new_qpos[q + 3 : q + 7] = product(turned, HALF_TURN) if body[1] < 0 else turned
+            new_qvel[v : v + 3] = WORLD * qvel[v : v + 3]
+            new_qvel[v + 3 : v + 6] = -body * qvel[v + 3 : v + 6]
+        elif joint.type[0] == JOINT.mjJNT_BALL:
+            new_qpos[q : q + 4] = np.array([1, 1, -1, -1]) * qpos[q : q + 4]
+            new_qvel[v : v + 3] = np.array([1, -1, -1]) * qvel[v : v + 3]
+        elif joint.name == "x":
+            new_qpos[q], new_qvel[v] = -qpos[q], -qvel[v]
+        elif joint.name == "yaw":
+            new_qpos[q], new_qvel[v] = np.pi - qpos[q], -qvel[v]
+        elif joint.name == "waist_x":
+            new_qpos[q], new_qvel[v] = -qpos[q], -qvel[v]
+        elif joint.name in robot.counterparts:
+            other = model.joint(robot.counterparts[joint.name])
+            new_qpos[q], new_qvel[v] = qpos[other.qposadr[0]], qvel[other.dofadr[0]]
+    return new_qpos, new_qvel
+
+
+def declared(env: SafetyGym) -> Mirror:
+    mirror = mirror_of(env)
+    assert mirror is not None
+    return mirror
+
+
+@pytest.mark.parametrize("name", SYMMETRIC)
+def test_a_mirrored_step_is_a_step_of_the_mirrored_world(name: str) -> None:
+    env = envs.make(name, physics="native")
+    assert isinstance(env, SafetyGym)
+    mirror = declared(env)
+    reset, reset_to, step = jax.jit(env.reset), jax.jit(env.reset_to), jax.jit(env.step)
+    rng = np.random.default_rng(0)
+
+    def random_action() -> np.ndarray:
+        return rng.uniform(env.action_low, env.action_high).astype(np.float32)
+
+    state = reset(jax.random.key(3))
+    for _ in range(20):  # to a state in which everything moves
+        state = step(state, random_action())
+    qpos, qvel = mirrored_poses(env, np.asarray(state.physics.data.qpos), np.asarray(state.physics.data.qvel))
+    layout = np.asarray(state.physics.layout)
+    state = reset_to(layout, state.physics.data.qpos, state.physics.data.qvel)
+    image = reset_to(layout * WORLD[:2], qpos, qvel)
+    moved = 0.0
+    for _ in range(10):
+        difference = np.abs(image.obs - mirror.obs(np.asarray(state.obs)))
+        assert difference[3:].max() < 0.01
+        assert difference[:3].max() < 0.3  # m/s^2: the solver finds contact forces to a tolerance only
+        action, before = random_action(), state.obs
+        state, image = step(state, action), step(image, mirror.action(action))
+        np.testing.assert_allclose(image.reward, state.reward, atol=1e-4)
+        assert image.cost == state.cost
+        moved = max(moved, float(np.abs(state.obs - before).max()))
+    assert moved > 0.1
+
+
+@pytest.mark.parametrize("name", SYMMETRIC)
+def test_two_mirrors_change_nothing_and_one_does(name: str) -> None:
+    env = envs.make(name)
+    assert isinstance(env, SafetyGym)
+    mirror = declared(env)
+    obs, action = np.arange(1.0, env.obs_dim + 1), np.arange(1.0, env.action_dim + 1)
+    np.testing.assert_array_equal(mirror.obs(mirror.obs(obs)), obs)
+    np.testing.assert_array_equal(mirror.action(mirror.action(action)), action)
+    assert (mirror.obs(obs) != obs).sum() > env.obs_dim / 2
+    assert (mirror.action(action) != action).any()
+
+
+@pytest.mark.parametrize("name", ["PointButton1", "CarButton1", "HalfCheetah", "Swimmer"])
+def test_no_symmetry_is_declared_where_none_is_known(name: str) -> None:
+    """Gremlins circle to one side, so a button task in the mirror is another task."""
+    assert mirror_of(envs.make(name)) is None

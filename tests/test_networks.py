@@ -1,0 +1,103 @@
+"""The critics' encoding of observations: its numbers, its range, and what it is for."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ccil_jax.acting import networks, running_statistics
+from ccil_jax.acting.networks import Network
+from ccil_jax.agents import build, on_policy
+from ccil_jax.agents.expert import expert_data
+from ccil_jax.config import Config, validate
+from ccil_jax.errors import ConfigError
+from ccil_jax.learning import regression
+from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
+
+IDENTITY = Network(init=lambda key: (), apply=lambda params, x: x)
+
+
+def encode(x: Any, low: Any, high: Any, num_intervals: int) -> np.ndarray:
+    network = networks.piecewise_linear(IDENTITY, jnp.asarray(low), jnp.asarray(high), num_intervals)
+    return np.asarray(network.apply((), jnp.asarray(x, jnp.float32)))
+
+
+def test_an_encoding_by_hand() -> None:
+    """Two entries, in [0, 4] and [-1, 1], and four intervals of each; the numbers of an interval are side by side."""
+    encoded = encode([[2.5, -0.75], [-1.0, 1.5]], [0.0, -1.0], [4.0, 1.0], 4).reshape(2, 4, 2)
+    np.testing.assert_array_equal(encoded[0, :, 0], [1, 1, 0.5, 0])
+    np.testing.assert_array_equal(encoded[0, :, 1], [0.5, 0, 0, 0])
+    np.testing.assert_array_equal(encoded[1, :, 0], [-1, 0, 0, 0])  # below the range
+    np.testing.assert_array_equal(encoded[1, :, 1], [1, 1, 1, 2])  # above it
+
+
+@pytest.mark.parametrize("num_intervals", [1, 5])
+def test_nothing_is_lost(num_intervals: int) -> None:
+    """The numbers of an entry, times the width of an interval, add up to its distance from the lower end; everywhere."""
+    x = np.random.default_rng(0).normal(size=(3, 7, 2)).astype(np.float32) * 3
+    low, high = np.array([-1.0, 0.5], np.float32), np.array([2.0, 0.75], np.float32)
+    encoded = encode(x, low, high, num_intervals).reshape(3, 7, num_intervals, 2)
+    np.testing.assert_allclose(encoded.sum(2) * (high - low) / num_intervals + low, x, rtol=1e-5, atol=1e-5)
+
+
+def test_a_step_that_a_plain_network_blurs() -> None:
+    """A cost that jumps within a hundredth of the range: after the same fit, the encoded critic explains most of it."""
+    obs = jax.random.uniform(jax.random.key(0), (4000, 2), minval=-1, maxval=1)
+    target = jnp.where(obs[:, 0] > 0.75, 1.0, 0.0)
+    config, bound = Config(hidden_sizes=(16,)), jnp.ones(2)
+    encoded = networks.piecewise_linear(networks.make_scalar(config, 2 * 16), -bound, bound, 16)
+    unexplained = []
+    for network in (networks.make_scalar(config, 2), encoded):
+        critic = regression.init(network.init(jax.random.key(1)), 1e-3)
+        fit = jax.jit(
+            lambda critic, network=network: regression.fit(
+                network.apply,
+                critic,
+                obs,
+                target,
+                jax.random.key(2),
+                learning_rate=1e-3,
+                num_epochs=5,
+                minibatch_size=64,
+            )
+        )
+        unexplained.append(float(fit(critic)[1] / jnp.var(target)))
+    assert unexplained[0] > 0.5
+    assert unexplained[1] < 0.3
+
+
+def parts_of(method: str, **changes: Any) -> on_policy.Parts:
+    demonstrations = walk_demonstrations() if method != "trpo" else None
+    config = build.resolve(walk_config(method=method, **changes), Walk(), demonstrations)
+    return on_policy.make_parts(config, Walk(), expert_data(demonstrations))
+
+
+@pytest.mark.parametrize("method", ["malm", "trpo"])
+def test_the_critics_range_is_that_of_the_demonstrations(method: str) -> None:
+    """Or, without any, that of clipped observations: the value bends at the edges of the intervals and nowhere else."""
+    with quick_compilation():
+        parts = parts_of(method, critic_intervals=2, hidden_sizes=(1,), activation="relu")
+        params = parts.critic.init(jax.random.key(0))
+    kernel = params["params"]["Dense_0"]["kernel"]
+    assert kernel.shape == (2 * Walk().obs_dim, 1)
+    # A first layer that sums the upper intervals of the first entry, a second that passes it on.
+    weights = jnp.zeros_like(kernel).at[Walk().obs_dim].set(1.0)
+    first = {"kernel": weights, "bias": jnp.zeros(1)}
+    second = {"kernel": jnp.ones((1, 1)), "bias": jnp.zeros(1)}
+    params = {"params": {"Dense_0": first, "Dense_1": second}}
+    if method == "trpo":
+        low, high = -running_statistics.CLIP, running_statistics.CLIP
+    else:
+        obs = expert_data(walk_demonstrations()).obs  # type: ignore[union-attr]
+        z = (obs[:, 0] - obs[:, 0].mean()) / obs[:, 0].std()
+        low, high = min(float(z.min()), -1.0), max(float(z.max()), 1.0)
+    middle = (low + high) / 2
+    points = jnp.zeros((3, Walk().obs_dim)).at[:, 0].set(jnp.array([middle - 0.1, middle, high]))
+    np.testing.assert_allclose(parts.critic.apply(params, points), [0.0, 0.0, 1.0], atol=2e-3)
+
+
+def test_no_fewer_than_no_intervals() -> None:
+    with pytest.raises(ConfigError, match="critic_intervals -1: must be at least 0"):
+        validate(Config(critic_intervals=-1))
