@@ -80,10 +80,8 @@ def test_a_mirrored_step_is_a_step_of_the_mirrored_world(name: str) -> None:
     state = reset_to(layout, state.physics.data.qpos, state.physics.data.qvel)
     image = reset_to(layout * WORLD[:2], qpos, qvel)
     moved = 0.0
-    for _ in range(10):
-        difference = np.abs(image.obs - mirror.obs(np.asarray(state.obs)))
-        assert difference[3:].max() < 0.01
-        assert difference[:3].max() < 0.3  # m/s^2: the solver finds contact forces to a tolerance only
+    for _ in range(5):  # rounding grows: sideways the robot sticks and slips
+        np.testing.assert_allclose(image.obs, mirror.obs(np.asarray(state.obs)), atol=5e-3)
         action, before = random_action(), state.obs
         state, image = step(state, action), step(image, mirror.action(action))
         np.testing.assert_allclose(image.reward, state.reward, atol=1e-4)

@@ -35,7 +35,7 @@ def test_an_encoding_by_hand() -> None:
 
 @pytest.mark.parametrize("num_intervals", [1, 5])
 def test_nothing_is_lost(num_intervals: int) -> None:
-    """The numbers of an entry, times the width of an interval, add up to its distance from the lower end; everywhere."""
+    """The numbers of an entry, times the width of an interval, add up to its distance from the lower end."""
     x = np.random.default_rng(0).normal(size=(3, 7, 2)).astype(np.float32) * 3
     low, high = np.array([-1.0, 0.5], np.float32), np.array([2.0, 0.75], np.float32)
     encoded = encode(x, low, high, num_intervals).reshape(3, 7, num_intervals, 2)
