@@ -26,6 +26,7 @@ from ccil_jax.uses import (
     CVAG,
     GAUSSIAN,
     HELD_OUT,
+    IMITATING,
     IQ_LEARN,
     LAGRANGIAN,
     LAGRANGIAN_LOSS,
@@ -38,6 +39,7 @@ from ccil_jax.uses import (
     PID,
     SGD,
     STANDARDIZED,
+    TD_LAMBDA,
     Use,
 )
 
@@ -56,6 +58,8 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "gate": ("batch", "episode"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
+    "critic_target": ("gae", "td_lambda"),
+    "mirrored_demonstrations": ("none", "symmetric_tasks"),
     "value_loss": ("value", "v0"),
 }
 
@@ -179,6 +183,11 @@ class Config:
         "apart values that lie close together (piecewise linear encoding, Gorishniy et al. 2022); 0 gives them the "
         "observations as they are",
     )
+    critic_target: str = _static(
+        "gae",
+        "what the critics learn: gae is advantage + value with the advantage's own lambda (authors), td_lambda the "
+        "lambda-return with critic_lambda, so that advantages can lean on the critics without spoiling what they learn",
+    )
     critic_epochs: int = _static(5, "passes of both critics over each batch (authors)")
     critic_minibatch_size: int = _static(
         128,
@@ -200,6 +209,12 @@ class Config:
         "likelihood of an action: gaussian is the density of the action as it was drawn (authors), censored that of "
         "the action as it is executed, where one at a bound of its range stands for all draws beyond it too",
         GAUSSIAN,
+    )
+    mirrored_demonstrations: str = _static(
+        "none",
+        "mirror images of the demonstrations that are demonstrations too: none, or symmetric_tasks for those of tasks "
+        "that declare a mirror symmetry, which changes nothing on other tasks",
+        IMITATING,
     )
     cloning_updates: int = _static(
         0,
@@ -232,6 +247,7 @@ class Config:
     cost_gae_lambda: float = _traced(
         0.97, "lambda of generalised advantage estimation, for the cost (Table 1)", CONSTRAINED
     )
+    critic_lambda: float = _traced(0.97, "lambda of the critics' targets", TD_LAMBDA)
     max_kl: float = _traced(0.01, "radius of the trust region: KL divergence from the old policy, nats (Table 1)")
     kl_tolerance: float = _traced(
         1.5, "the line search accepts a step whose KL divergence is at most this multiple of max_kl (authors)"
@@ -498,7 +514,7 @@ def _check_ranges(config: Config) -> None:
         value = getattr(config, name)
         if value is not None and not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"--{name} {value}: must be finite and not negative")
-    for name in ("gamma", "gae_lambda", "cost_gae_lambda"):
+    for name in ("gamma", "gae_lambda", "cost_gae_lambda", "critic_lambda"):
         if getattr(config, name) > 1:
             raise ConfigError(f"--{name} {getattr(config, name)}: must be at most 1")
     if config.max_kl == 0:

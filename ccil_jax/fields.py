@@ -33,11 +33,13 @@ class Fields(TypedDict, total=False):
     fisher_stride: int
     line_search_steps: int
     critic_intervals: int
+    critic_target: str
     critic_epochs: int
     critic_minibatch_size: int
     standardize_cost_advantage: bool
     bootstrap_at_truncation: bool
     action_likelihood: str
+    mirrored_demonstrations: str
     cloning_updates: int
     warmup_iterations: int
     replay_size: int
@@ -47,6 +49,7 @@ class Fields(TypedDict, total=False):
     gamma: float
     gae_lambda: float
     cost_gae_lambda: float
+    critic_lambda: float
     max_kl: float
     kl_tolerance: float
     cg_damping: float

@@ -39,6 +39,12 @@ class Use:
 ALL = Use(lambda row: True, "every method")
 ACTING = Use(lambda row: row.agent != "behavior_cloning", "every method that acts while it learns: all but {others}")
 ON_POLICY = Use(lambda row: row.agent == "on_policy", "every on-policy method: all but {others}")
+TD_LAMBDA = Use(
+    ON_POLICY.reads,
+    "on-policy methods whose critic_target is td_lambda",
+    lambda config: config.critic_target == "td_lambda",
+)
+IMITATING = Use(lambda row: row.imitates, "every method that imitates ({methods})")
 ADVERSARIAL = Use(lambda row: row.reward == "discriminator", "methods with a discriminator ({methods})")
 PENALIZED = Use(
     ADVERSARIAL.reads,

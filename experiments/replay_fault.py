@@ -50,13 +50,13 @@ def replay(path: Path, demos: Path | None = None) -> list[str]:
     import jax
 
     from ccil_jax.agents import build
-    from ccil_jax.agents.expert import expert_data
+    from ccil_jax.agents.expert import expert_of
     from ccil_jax.training import guard
     from envs.jax_tools import full_precision
 
     env = build_environment(task.name, run.facts["physics"], run.facts["env_options"])
     config = build.resolve(run.config, env, demonstrations)
-    agent = build.make(config, env, expert_data(demonstrations))
+    agent = build.make(config, env, expert_of(config, env, demonstrations))
     state = fault_files.read_state(path, jax.eval_shape(agent.init, jax.random.key(0)))
     state, metrics = jax.jit(full_precision(agent.step))(state)  # as in training
     return [*guard.not_finite({"metrics": metrics}), *guard.not_finite({"state": state})]

@@ -7,7 +7,7 @@ from ccil_jax import user_code
 from ccil_jax.acting.networks import Network, Policy
 from ccil_jax.agents import behavior_cloning, contracts, iq_learn, on_policy
 from ccil_jax.agents.base import Agent
-from ccil_jax.agents.expert import expert_data
+from ccil_jax.agents.expert import expert_of
 from ccil_jax.config import Config, validate, with_limit_of
 from ccil_jax.demonstrations.trajectories import Demonstrations, check_time_limit
 from ccil_jax.errors import ConfigError
@@ -118,7 +118,7 @@ def make_agent(
         "optimizer": optimizer,
     }
     own = {name: part for name, part in given.items() if part is not None}
-    agent = make(config, env, expert_data(demonstrations), **own)
+    agent = make(config, env, expert_of(config, env, demonstrations), **own)
     return Agent(init=full_precision(agent.init), step=full_precision(agent.step))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents.build import resolve
-from ccil_jax.agents.expert import expert_data
+from ccil_jax.agents.expert import expert_of
 from ccil_jax.config import Config, field_names
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.earlier_versions import GONE
@@ -183,7 +183,7 @@ def _train(
         program = compile_program(
             shared,
             env,
-            expert_data(demonstrations),
+            expert_of(shared, env, demonstrations),
             len(configs) * settings.num_seeds,
             varied=varied,
             one_by_one=settings.one_by_one,

@@ -188,8 +188,8 @@ _DOGGO_HINGES = tuple(f"{kind.format(leg)}" for kind in ("hip_{}_z", "hip_{}_y",
 
 def _doggo_counterparts() -> dict[str, str]:
     """What belongs to a left leg and what belongs to the right leg at the same end."""
-    names = ("hip_{}_z", "hip_{}_y", "ankle_{}")
-    names = (*names, *(f"velocity_{name}" for name in names), "touch_{}a", "touch_{}b")
+    hinges = ("hip_{}_z", "hip_{}_y", "ankle_{}")
+    names = (*hinges, *(f"velocity_{hinge}" for hinge in hinges), "touch_{}a", "touch_{}b")
     return {name.format(leg): name.format(LEGS[-1 - i]) for name in names for i, leg in enumerate(LEGS)}
 
 

@@ -16,7 +16,7 @@ import envs
 from ccil_jax import meshes
 from ccil_jax.acting import networks, rollout, running_statistics
 from ccil_jax.agents import build
-from ccil_jax.agents.expert import expert_data
+from ccil_jax.agents.expert import expert_of
 from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step
 from ccil_jax.training import program
@@ -182,7 +182,7 @@ def training_work(config: Config, env: Any, setting: Setting) -> tuple[Work, flo
     """Runs whole iterations as `train` does. The second value is the seconds that it took to compile them."""
     expert = noise(env, setting)
     resolved = build.resolve(config, env, expert)
-    compiled = program.compile_program(resolved, env, expert_data(expert), setting.num_seeds)
+    compiled = program.compile_program(resolved, env, expert_of(resolved, env, expert), setting.num_seeds)
     state = compiled.init(jax.random.split(jax.random.key(setting.seed), setting.num_seeds))
 
     def work() -> int:

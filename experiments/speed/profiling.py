@@ -11,7 +11,7 @@ import numpy as np
 import envs
 from ccil_jax.acting import rollout
 from ccil_jax.agents import build, on_policy
-from ccil_jax.agents.expert import expert_data
+from ccil_jax.agents.expert import expert_of
 from ccil_jax.agents.on_policy import AgentState, Parts
 from ccil_jax.learning import policy_step
 from ccil_jax.learning.policy_step import PolicyStep
@@ -88,7 +88,7 @@ def works(setting: Setting, env: Any) -> dict[str, Work]:
     """The work that is timed, by name: each piece for all seeds together, on data of an untrained learner."""
     demonstrations = noise(env, setting)
     config = build.resolve(make_config(setting), env, demonstrations)
-    parts = on_policy.make_parts(config, env, expert_data(demonstrations))
+    parts = on_policy.make_parts(config, env, expert_of(config, env, demonstrations))
     pieces, num_seeds = pieces_of(parts), setting.num_seeds
     keys = jax.random.split(jax.random.key(setting.seed), num_seeds)
     state = spread(functools.partial(on_policy.init, parts), num_seeds)(keys)
