@@ -77,6 +77,16 @@ QUESTIONS: Mapping[str, Question] = {
             "cost, 0.0005": {"multiplier_update": "sgd", "gap_unit": "cost", "multiplier_learning_rate": 0.0005},
         },
     ),
+    "critic_intervals": _one_field("Do critics see observations in intervals?", "critic_intervals", (16, 0)),
+    "critic_target": _one_field(
+        "Have the critics' targets a lambda of their own?", "critic_target", ("td_lambda", "gae")
+    ),
+    "cost_gae_lambda": _one_field(
+        "How much do the cost's advantages lean on its critic?", "cost_gae_lambda", (0.5, 0.9, 0.97)
+    ),
+    "mirrored_demonstrations": _one_field(
+        "Do mirror images of the demonstrations help?", "mirrored_demonstrations", ("symmetric_tasks", "none")
+    ),
     "batch_size": _one_field("How large a batch?", "batch_size", (4000, 2000, 8000)),
     "meta_gradient": _one_field(
         "Does the multiplier's gradient through the policy step help?",

@@ -37,8 +37,9 @@ def test_the_first_answer_is_the_papers_or_that_of_the_default(tmp_path: Path) -
         return {name for name in names if answers[name, next(iter(QUESTIONS[name].answers))].name not in METHODS}
 
     newer = {"cloning_updates", "action_likelihood", "cloning_weight", "warmup_iterations", "outer_loss", "gap_unit"}
-    assert changed(QUESTIONS, "paper") == newer | {"batch_size"}
-    assert changed(newer | {"batch_size"}, "default") == set()
+    newer |= {"critic_intervals", "critic_target", "cost_gae_lambda", "mirrored_demonstrations", "batch_size"}
+    assert changed(QUESTIONS, "paper") == newer
+    assert changed(newer, "default") == set()
 
 
 def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: Path) -> None:
@@ -52,6 +53,7 @@ def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: P
         *(f"malm,multiplier_learning_rate={rate}" for rate in (0.01, 0.2)),
         *(f"malm,meta_learning_rate={rate}" for rate in (0.01, 0.2)),
         *(f"malm,initial_multiplier={start}" for start in (1.0, 10.0)),
+        "malm,cost_gae_lambda=0.9",
     } in names
     assert sum(map(len, names)) == len(different)
     # As few as there are static configurations, and at most one more for each baseline's speed.

@@ -38,10 +38,20 @@ VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHOD
     "malm with the Lagrangian as outer loss": {"method": "malm", "outer_loss": "lagrangian"},
     "ccil that begins with a clone": {"method": "ccil", "cloning_updates": 200},
     "gail that begins with a clone": {"method": "gail", "cloning_updates": 200},
+    "gail with targets of their own": {"method": "gail", "critic_target": "td_lambda"},
 }
 # Multiplied by the weight 0 of a cost that does not enter: a dependence by the text of the program alone.
 TIMES_ZERO = {"cost_gae_lambda"}
-NOTHING = dict.fromkeys(("gail", "trpo", "gail without a penalty", "gail that begins with a clone"), TIMES_ZERO)
+NOTHING = dict.fromkeys(
+    (
+        "gail",
+        "trpo",
+        "gail without a penalty",
+        "gail that begins with a clone",
+        "gail with targets of their own",
+    ),
+    TIMES_ZERO,
+)
 OTHER: dict[str, Any] = {  # another value of each static field that narrows what a method is
     "discriminator_steps": 2,
     "discriminator_minibatch_size": 8,
@@ -65,8 +75,10 @@ OTHER: dict[str, Any] = {  # another value of each static field that narrows wha
     "action_likelihood": "censored",
     "cloning_updates": 300,
     "warmup_iterations": 2,
+    "critic_target": "td_lambda",
 }
-OUTSIDE = {"env_steps", "max_skipped_updates"}  # how long, and when to give up: not of an iteration
+# How long, when to give up, and what the demonstrations are: not of an iteration.
+OUTSIDE = {"env_steps", "max_skipped_updates", "mirrored_demonstrations"}
 
 
 def resolved(changes: dict[str, Any]) -> Config:

@@ -6,6 +6,11 @@ import numpy as np
 import pytest
 
 import envs
+from ccil_jax.agents import build
+from ccil_jax.agents.expert import expert_of
+from ccil_jax.config import Config
+from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.types import ExpertData
 from envs.base import Mirror, mirror_of
 from envs.safety_gym.environment import SafetyGym
 from envs.safety_gym.robots import ROBOTS
@@ -106,3 +111,61 @@ def test_two_mirrors_change_nothing_and_one_does(name: str) -> None:
 def test_no_symmetry_is_declared_where_none_is_known(name: str) -> None:
     """Gremlins circle to one side, so a button task in the mirror is another task."""
     assert mirror_of(envs.make(name)) is None
+
+
+# As demonstrations ---------------------------------------------------------------------------------------------------
+
+
+def learnt_from(name: str, choice: str, demonstrations: Demonstrations) -> ExpertData:
+    config = Config(method="iq_learn", mirrored_demonstrations=choice)
+    data = expert_of(config, envs.make(name), demonstrations)
+    assert data is not None
+    return data
+
+
+def random_demonstrations(name: str) -> Demonstrations:
+    """Two episodes of ten steps; their numbers mean nothing."""
+    env, rng, end = envs.make(name), np.random.default_rng(0), np.arange(20) % 10 == 9
+    return Demonstrations(
+        obs=rng.normal(size=(20, env.obs_dim)).astype(np.float32),
+        actions=rng.normal(size=(20, env.action_dim)).astype(np.float32),
+        rewards=None,
+        costs=np.ones(20, np.float32),
+        terminated=end & (np.arange(20) > 10),
+        truncated=end & (np.arange(20) < 10),
+        episode_ends=np.array([10, 20]),
+    )
+
+
+def test_images_follow_the_demonstrations_and_nothing_is_known_of_held_out_steps() -> None:
+    name = "CarGoal1"
+    demonstrations, mirror = random_demonstrations(name), mirror_of(envs.make(name))
+    plain, doubled = (learnt_from(name, choice, demonstrations) for choice in ("none", "symmetric_tasks"))
+    assert mirror is not None
+    assert plain.transitions is not None
+    assert doubled.transitions is not None
+    for own, both, image in (
+        (plain.obs, doubled.obs, mirror.obs),
+        (plain.action, doubled.action, mirror.action),
+        (plain.held_out_obs, doubled.held_out_obs, mirror.obs),
+        (plain.held_out_action, doubled.held_out_action, mirror.action),
+        (plain.transitions.obs, doubled.transitions.obs, mirror.obs),
+        (plain.transitions.next_obs, doubled.transitions.next_obs, mirror.obs),
+        (plain.transitions.action, doubled.transitions.action, mirror.action),
+        (plain.transitions.initial_obs, doubled.transitions.initial_obs, mirror.obs),
+        (plain.transitions.terminated, doubled.transitions.terminated, lambda flags: flags),
+    ):
+        np.testing.assert_array_equal(both, np.concatenate([own, image(own)]))
+
+
+def test_a_task_without_a_symmetry_has_no_images() -> None:
+    demonstrations = random_demonstrations("Swimmer")
+    plain, same = (learnt_from("Swimmer", choice, demonstrations) for choice in ("none", "symmetric_tasks"))
+    jax.tree.map(np.testing.assert_array_equal, plain, same)
+
+
+def test_the_limit_stays_that_of_the_demonstrations() -> None:
+    """The expert has not paid for the images."""
+    env, demonstrations = envs.make("PointGoal1"), random_demonstrations("PointGoal1")
+    config = Config(method="ccil", mirrored_demonstrations="symmetric_tasks")
+    assert build.resolve(config, env, demonstrations).cost_limit == 10.0

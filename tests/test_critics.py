@@ -1,5 +1,6 @@
-"""The critics' encoding of observations: its numbers, its range, and what it is for."""
+"""Critics: the encoding of their observations (numbers, range, what it is for) and what they are fitted to."""
 
+import functools
 from typing import Any
 
 import jax
@@ -7,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ccil_jax.acting import networks, running_statistics
+from ccil_jax.acting import networks, rollout, running_statistics
 from ccil_jax.acting.networks import Network
 from ccil_jax.agents import build, on_policy
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.config import Config, validate
 from ccil_jax.errors import ConfigError
 from ccil_jax.learning import regression
+from ccil_jax.types import Batch
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
 IDENTITY = Network(init=lambda key: (), apply=lambda params, x: x)
@@ -101,3 +103,35 @@ def test_the_critics_range_is_that_of_the_demonstrations(method: str) -> None:
 def test_no_fewer_than_no_intervals() -> None:
     with pytest.raises(ConfigError, match="critic_intervals -1: must be at least 0"):
         validate(Config(critic_intervals=-1))
+
+
+# What they are fitted to ---------------------------------------------------------------------------------------------
+
+
+def assessed(**changes: Any) -> Batch:
+    """The same steps, as untrained critics see them."""
+    parts = parts_of("ccil", **{"gae_lambda": 0.9, "cost_gae_lambda": 0.3, "gamma": 0.95} | changes)
+    with quick_compilation():
+        state = jax.jit(functools.partial(on_policy.init, parts))(jax.random.key(0))
+        _, transition = rollout.rollout(
+            Walk(), parts.policy.apply, state.actor, state.rollout, parts.config.num_steps, jax.random.key(1)
+        )
+        return jax.jit(functools.partial(on_policy.assess, parts))(state, transition)[0]
+
+
+@pytest.mark.parametrize("critic_lambda", [0.0, 0.7])
+def test_the_target_has_a_lambda_of_its_own(critic_lambda: float) -> None:
+    """It is that of a method whose advantages have this lambda; advantages, and samples, stay what they are."""
+    own = assessed(critic_target="td_lambda", critic_lambda=critic_lambda)
+    usual, expected = assessed(), assessed(gae_lambda=critic_lambda, cost_gae_lambda=critic_lambda)
+    np.testing.assert_allclose(own.returns, expected.returns, rtol=1e-5, atol=1e-6)
+    assert np.abs(own.returns - usual.returns).max() > 1e-3
+    np.testing.assert_array_equal(own.reward_advantage, usual.reward_advantage)
+    np.testing.assert_array_equal(own.cost_advantage, usual.cost_advantage)
+
+
+def test_without_a_choice_the_advantages_lambda_is_that_of_the_target() -> None:
+    with pytest.raises(ConfigError, match=r"critic_lambda 0\.5: makes no difference .*critic_target is td_lambda"):
+        validate(Config(critic_lambda=0.5))
+    with pytest.raises(ConfigError, match=r"critic_lambda 1\.5: must be at most 1"):
+        validate(Config(critic_target="td_lambda", critic_lambda=1.5))
