@@ -76,7 +76,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "multiplier_update": "sgd",
         "multiplier_learning_rate": 7e-4,
     },
-    "bc": {"method": "bc", "action_likelihood": "censored", "cloning_updates": 20_000},
+    "bc": {
+        "method": "bc",
+        "action_likelihood": "censored",
+        "mirrored_demonstrations": "symmetric_tasks",
+        "cloning_updates": 20_000,
+    },
     # As published, except for the length: 60,000 steps with as many updates were enough on HalfCheetah.
     "iq_learn": {
         "method": "iq_learn",

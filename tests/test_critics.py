@@ -135,3 +135,13 @@ def test_without_a_choice_the_advantages_lambda_is_that_of_the_target() -> None:
         validate(Config(critic_lambda=0.5))
     with pytest.raises(ConfigError, match=r"critic_lambda 1\.5: must be at most 1"):
         validate(Config(critic_target="td_lambda", critic_lambda=1.5))
+
+
+def test_explained_variance_by_hand() -> None:
+    """Of a perfect critic, of one that is off by a constant, of one that knows nothing, of one that is worse."""
+    target = np.array([[1.0, 2.0], [3.0, 6.0]], np.float32)
+    values = np.stack([target, target + 5, np.zeros((2, 2)), -target]).astype(np.float32)
+    explained = on_policy.explained_variance(jnp.asarray(values), jnp.broadcast_to(target, (4, 2, 2)))
+    np.testing.assert_allclose(explained, [1, 1, 0, -3], rtol=1e-6)
+    nothing = jnp.ones((1, 2, 2))
+    np.testing.assert_array_equal(on_policy.explained_variance(nothing * 7, nothing), [0.0])

@@ -208,7 +208,7 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
     step_gap = cost_gap / jnp.maximum(estimates.episode_length, 1.0)
     multiplier = constraint.multiplier(state.constraint)
 
-    samples, mean_reward = assess(parts, state, transition)
+    samples, assess_metrics = assess(parts, state, transition)
     order = policy_step.random_order(config, split_key)
     held_out, training = policy_step.split(samples, config.num_held_out, order)
     params, taken, step_metrics = policy_step.improve(
@@ -231,9 +231,9 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
     statistics = state.actor.obs_statistics
     if parts.clone is None:  # other statistics would make another policy of the clone's parameters
         statistics = running_statistics.update(statistics, transition.obs)
-    metrics = step_metrics | {
+    metrics = step_metrics | assess_metrics
+    metrics |= {
         "episodes_finished": finished,
-        "imitation_reward": mean_reward,
         "mean_cost": jnp.mean(transition.cost),
         "reward_critic_loss": critic_losses[REWARD],
         "cost_critic_loss": critic_losses[COST],
@@ -286,8 +286,8 @@ def episodes_of_steps(transition: Transition, limit: jax.Array, max_episode_step
     return EpisodeCosts(cost=cost, limit=limit)
 
 
-def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Batch, jax.Array]:
-    """Scores a batch: rewards, values, advantages and returns of both signals. Returns [K] samples and mean reward."""
+def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Batch, Metrics]:
+    """Scores a batch: rewards, values, advantages and returns of both signals. Returns [K] samples and metrics."""
     config = parts.config
 
     def normalize(obs: jax.Array) -> jax.Array:
@@ -324,7 +324,23 @@ def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Bat
         returns=jnp.moveaxis(returns, 0, -1),
         cost=transition.cost,
     )
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), jnp.mean(reward)
+    explained = explained_variance(value, returns)
+    metrics = {
+        "imitation_reward": jnp.mean(reward),
+        "reward_critic_explained_variance": explained[REWARD],
+        "cost_critic_explained_variance": explained[COST],
+    }
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
+
+
+def explained_variance(value: jax.Array, target: jax.Array) -> jax.Array:
+    """1 - Var(target - value) / Var(target) over the last two axes; 0 where the targets do not vary.
+
+    1 is a perfect critic and 0 one that knows no more than a constant. Steps of a new batch are new to the critics, so
+    one that has memorised earlier batches is below 0.
+    """
+    total, left = (jnp.var(x, axis=(-2, -1)) for x in (target, target - value))
+    return jnp.where(total > 0, 1 - left / jnp.where(total > 0, total, 1.0), 0.0)
 
 
 def fit_critics(parts: Parts, critics: Critic, batch: Batch, key: jax.Array) -> tuple[Critic, jax.Array]:

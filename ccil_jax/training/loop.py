@@ -105,7 +105,9 @@ def _advance(program: Program, config: Config, snapshot: Snapshot, length: int) 
     # Cut by NumPy: JAX would compile a slice for every length.
     rows = _rows({name: np.asarray(value)[:, :length] for name, value in metrics.items()}, snapshot.iteration, config)
     before = snapshot.history
-    history = {name: np.concatenate([before[name], row]) if before else row for name, row in rows.items()}
+    # Of a metric that an earlier version did not have, the rows so far are unknown.
+    unknown = np.full((snapshot.iteration, len(snapshot.stopped)), np.nan)
+    history = {name: np.concatenate([before.get(name, unknown), row]) if before else row for name, row in rows.items()}
     return snapshot_of(config, snapshot.iteration + length, state, history)
 
 

@@ -38,6 +38,8 @@ METRICS = (  # order of the columns of metrics.csv, which has those that the met
     "discriminator_accuracy_expert",
     "discriminator_accuracy_learner",
     "discriminator_accuracy_held_out",
+    "reward_critic_explained_variance",
+    "cost_critic_explained_variance",
     "reward_critic_loss",
     "cost_critic_loss",
     "critic_loss",
