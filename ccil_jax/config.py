@@ -26,6 +26,7 @@ from ccil_jax.uses import (
     CVAG,
     GAUSSIAN,
     HELD_OUT,
+    IMITATION,
     IQ_LEARN,
     LAGRANGIAN,
     LAGRANGIAN_LOSS,
@@ -54,6 +55,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "gap_unit": ("cost", "limit"),
     "meta_update": ("adam", "sgd"),
     "gate": ("batch", "episode"),
+    "imitation_reward": ("discriminator", "coherent"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "value_loss": ("value", "v0"),
@@ -153,6 +155,13 @@ class Config:
         "batch",
         "whether reward or cost is followed is decided once a batch (Algorithm 2) or for each episode (authors)",
         CVAG,
+    )
+    imitation_reward: str = _static(
+        "discriminator",
+        "what rewards the learner for being like the expert: discriminator is a classifier that is trained to tell the "
+        "two apart (GAIL), coherent is log q(a|s) - log p(a), where q is the clone of the demonstrations, held fixed, "
+        "and p a Gaussian of mean 0 and the policy's initial deviation (Watson, Huang and Heess 2023)",
+        IMITATION,
     )
     reward_form: str = _static(
         "softplus",
@@ -547,6 +556,11 @@ def _check_method(config: Config) -> None:
         )
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
+    if config.imitation_reward == "coherent" and config.cloning_updates == 0:
+        raise ConfigError(
+            "--imitation_reward coherent: is computed from a clone of the demonstrations, and there is none; give "
+            "--cloning_updates a number such as 20000, or use --imitation_reward discriminator"
+        )
     if config.row.agent == "behavior_cloning" and config.cloning_updates == 0:
         raise ConfigError("--cloning_updates 0: method bc would learn nothing; give a number such as 20000")
     if LIMITED.holds(config) and config.cost_limit is None:

@@ -39,11 +39,19 @@ class Use:
 ALL = Use(lambda row: True, "every method")
 ACTING = Use(lambda row: row.agent != "behavior_cloning", "every method that acts while it learns: all but {others}")
 ON_POLICY = Use(lambda row: row.agent == "on_policy", "every on-policy method: all but {others}")
-ADVERSARIAL = Use(lambda row: row.reward == "discriminator", "methods with a discriminator ({methods})")
+IMITATION = Use(
+    lambda row: row.agent == "on_policy" and row.reward == "discriminator",
+    "methods with an imitation reward ({methods})",
+)
+ADVERSARIAL = Use(
+    lambda row: row.reward == "discriminator",
+    "methods with a discriminator ({methods}), unless imitation_reward is coherent",
+    lambda config: config.imitation_reward == "discriminator",
+)
 PENALIZED = Use(
     ADVERSARIAL.reads,
     "methods with a discriminator whose discriminator_regularizer is gradient_penalty",
-    lambda config: config.discriminator_regularizer == "gradient_penalty",
+    lambda config: ADVERSARIAL.where(config) and config.discriminator_regularizer == "gradient_penalty",
 )
 CONSTRAINED = Use(lambda row: row.limit is not None, "methods in which the cost enters ({methods})")
 STANDARDIZED = Use(

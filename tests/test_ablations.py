@@ -37,6 +37,7 @@ def test_the_first_answer_is_the_papers_or_that_of_the_default(tmp_path: Path) -
         return {name for name in names if answers[name, next(iter(QUESTIONS[name].answers))].name not in METHODS}
 
     newer = {"cloning_updates", "action_likelihood", "cloning_weight", "warmup_iterations", "outer_loss", "gap_unit"}
+    newer |= {"imitation_reward"}
     assert changed(QUESTIONS, "paper") == newer | {"batch_size"}
     assert changed(newer | {"batch_size"}, "default") == set()
 

@@ -92,14 +92,15 @@ def make_parts(
     clone = None
     if config.reads("cloning_updates") and config.cloning_updates:
         clone = behavior_cloning.make(config, env, expert, policy=own, optimizer=optimizer)
+    acting = networks.with_likelihood(config, env, contracts.policy(own, env.action_dim))
+    if reward_model is None:
+        reward_model = reward_models.make(config, env, expert, optimizer, acting)
     return Parts(
         config=config,
         env=env,
-        policy=networks.with_likelihood(config, env, contracts.policy(own, env.action_dim)),
+        policy=acting,
         critic=contracts.critic(networks.make_scalar(config, env.obs_dim) if critic is None else critic),
-        reward_model=contracts.reward_model(
-            reward_models.make(config, env, expert, optimizer) if reward_model is None else reward_model
-        ),
+        reward_model=contracts.reward_model(reward_model),
         constraint=contracts.constraint(constraints.make(config) if constraint is None else constraint),
         optimizer=optimizer,
         expert=expert,
@@ -127,10 +128,11 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
     critic_params = jax.vmap(parts.critic.init)(jax.random.split(critic_key, 2))
     init_critic = functools.partial(regression.init, optimizer=parts.optimizer)
     zero = jnp.zeros(())
+    actor = first_actor(parts, policy_key)
     return AgentState(
-        actor=first_actor(parts, policy_key),
+        actor=actor,
         critics=jax.vmap(init_critic, in_axes=(0, None))(critic_params, config.critic_learning_rate),
-        reward_model=parts.reward_model.init(reward_key),
+        reward_model=parts.reward_model.begin(parts.reward_model.init(reward_key), actor),
         constraint=parts.constraint.init(),
         rollout=rollout.init(env, config.num_envs, env_key),
         estimates=EpisodeEstimates(episode_return=zero, episode_cost=parts.limit, episode_length=zero),
