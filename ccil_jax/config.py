@@ -185,7 +185,7 @@ class Config:
     critic_epochs: int = _static(5, "passes of both critics over each batch (authors)")
     critic_minibatch_size: int = _static(
         128,
-        "samples in one gradient step of a critic (authors), of bc's policy, or of iq_learn, which takes as many again "
+        "samples in one gradient step of a critic (authors), of cloning, or of iq_learn, which takes as many again "
         "from the demonstrations",
         ALL,
     )
@@ -265,7 +265,7 @@ class Config:
     pid_derivative_gain: float = _traced(0.5, "gain of the rise of the smoothed gap, where it rises", PID)
     pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap in the new one", PID)
     actor_learning_rate: float = _traced(
-        1e-3, "learning rate of the policy of bc, iq_learn and the cloning before another method, Adam", ACTOR
+        1e-3, "learning rate of the policy in cloning, by bc or before another method, and in iq_learn, Adam", ACTOR
     )
     target_update_rate: float = _traced(
         0.005, "share of the critic in each update of its Polyak average, the target critic (published)", IQ_LEARN

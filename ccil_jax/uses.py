@@ -91,7 +91,10 @@ LAGRANGIAN_LOSS = Use(
 )
 CVAG = Use(lambda row: row.constraint == "alternating")
 GAUSSIAN = Use(lambda row: row.agent in ("on_policy", "behavior_cloning"), "methods with a Gaussian policy ({methods})")
-CLONING = Use(lambda row: GAUSSIAN.reads(row) and row.imitates, "methods that can begin with a clone ({methods})")
+CLONING = Use(
+    lambda row: row.imitates and row.agent in ("on_policy", "behavior_cloning", "iq_learn"),
+    "methods that can begin with a clone ({methods})",
+)
 CLONED = Use(
     lambda row: row.agent == "on_policy" and row.imitates,
     "{methods} whose cloning_updates are above 0",
@@ -99,7 +102,7 @@ CLONED = Use(
 )
 IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
 ACTOR = Use(
-    lambda row: row.agent == "iq_learn" or CLONING.reads(row),
+    CLONING.reads,
     "{methods}; an on-policy method only if its cloning_updates are above 0",
     lambda config: config.row.agent != "on_policy" or config.cloning_updates > 0,
 )

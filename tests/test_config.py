@@ -38,6 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHOD
     "malm with the Lagrangian as outer loss": {"method": "malm", "outer_loss": "lagrangian"},
     "ccil that begins with a clone": {"method": "ccil", "cloning_updates": 200},
     "gail that begins with a clone": {"method": "gail", "cloning_updates": 200},
+    "iq_learn that begins with a clone": {"method": "iq_learn", "cloning_updates": 200},
     "malm with the coherent reward": {"method": "malm", "cloning_updates": 200, "imitation_reward": "coherent"},
     "gail with the coherent reward": {"method": "gail", "cloning_updates": 200, "imitation_reward": "coherent"},
 }

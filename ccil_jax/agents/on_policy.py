@@ -146,9 +146,7 @@ def first_actor(parts: Parts, key: jax.Array) -> Actor:
     """The policy before the first iteration: the clone where there is one, with the demonstrations' statistics."""
     if parts.clone is None:
         return Actor(policy_params=parts.policy.init(key), obs_statistics=running_statistics.init(parts.env.obs_dim))
-    clone, length = parts.clone, parts.config.num_cloning_iterations
-    state, _ = scan(lambda state, _: clone.step(state), clone.init(key), jnp.arange(length))
-    return state.actor
+    return behavior_cloning.learn(parts.clone, parts.config.num_cloning_iterations, key)
 
 
 def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
