@@ -27,6 +27,7 @@ from ccil_jax.uses import (
     GAUSSIAN,
     HELD_OUT,
     IMITATING,
+    IMITATION,
     IQ_LEARN,
     LAGRANGIAN,
     LAGRANGIAN_LOSS,
@@ -56,6 +57,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "gap_unit": ("cost", "limit"),
     "meta_update": ("adam", "sgd"),
     "gate": ("batch", "episode"),
+    "imitation_reward": ("discriminator", "coherent"),
     "reward_form": ("softplus", "logit", "log_sigmoid"),
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "critic_target": ("gae", "td_lambda"),
@@ -158,6 +160,13 @@ class Config:
         "whether reward or cost is followed is decided once a batch (Algorithm 2) or for each episode (authors)",
         CVAG,
     )
+    imitation_reward: str = _static(
+        "discriminator",
+        "what rewards the learner for being like the expert: discriminator is a classifier that is trained to tell the "
+        "two apart (GAIL), coherent is log q(a|s) - log p(a), where q is the clone of the demonstrations, held fixed, "
+        "and p a Gaussian of mean 0 and the policy's initial deviation (Watson, Huang and Heess 2023)",
+        IMITATION,
+    )
     reward_form: str = _static(
         "softplus",
         "reward of the learner, from the discriminator's logit h: softplus(h) = -log D, logit h, or log sigmoid(h)",
@@ -191,7 +200,7 @@ class Config:
     critic_epochs: int = _static(5, "passes of both critics over each batch (authors)")
     critic_minibatch_size: int = _static(
         128,
-        "samples in one gradient step of a critic (authors), of bc's policy, or of iq_learn, which takes as many again "
+        "samples in one gradient step of a critic (authors), of cloning, or of iq_learn, which takes as many again "
         "from the demonstrations",
         ALL,
     )
@@ -278,7 +287,7 @@ class Config:
     pid_derivative_gain: float = _traced(0.5, "gain of the rise of the smoothed gap, where it rises", PID)
     pid_smoothing: float = _traced(0.9, "share of the previous smoothed gap in the new one", PID)
     actor_learning_rate: float = _traced(
-        1e-3, "learning rate of the policy of bc, iq_learn and the cloning before another method, Adam", ACTOR
+        1e-3, "learning rate of the policy in cloning, by bc or before another method, and in iq_learn, Adam", ACTOR
     )
     target_update_rate: float = _traced(
         0.005, "share of the critic in each update of its Polyak average, the target critic (published)", IQ_LEARN
@@ -569,6 +578,11 @@ def _check_method(config: Config) -> None:
         )
     if IQ_LEARN.holds(config) and config.chi2_coefficient == 0:
         raise ConfigError("--chi2_coefficient 0: the loss divides by it; give a positive number such as 0.5")
+    if config.imitation_reward == "coherent" and config.cloning_updates == 0:
+        raise ConfigError(
+            "--imitation_reward coherent: is computed from a clone of the demonstrations, and there is none; give "
+            "--cloning_updates a number such as 20000, or use --imitation_reward discriminator"
+        )
     if config.row.agent == "behavior_cloning" and config.cloning_updates == 0:
         raise ConfigError("--cloning_updates 0: method bc would learn nothing; give a number such as 20000")
     if LIMITED.holds(config) and config.cost_limit is None:

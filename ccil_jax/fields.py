@@ -27,6 +27,7 @@ class Fields(TypedDict, total=False):
     gap_unit: str
     meta_update: str
     gate: str
+    imitation_reward: str
     reward_form: str
     discriminator_regularizer: str
     cg_iterations: int

@@ -2,7 +2,7 @@
 
 Importing this module imports no JAX. A part of a row is a key of the table that holds the functions (`agents.build`,
 `acting.networks`, `learning.reward_models`, `learning.constraints`), or a function of the user's own with the same
-arguments as the functions there.
+arguments as the functions there (without the policy, for a reward).
 """
 
 import functools

@@ -45,11 +45,19 @@ TD_LAMBDA = Use(
     lambda config: config.critic_target == "td_lambda",
 )
 IMITATING = Use(lambda row: row.imitates, "every method that imitates ({methods})")
-ADVERSARIAL = Use(lambda row: row.reward == "discriminator", "methods with a discriminator ({methods})")
+IMITATION = Use(
+    lambda row: row.agent == "on_policy" and row.reward == "discriminator",
+    "methods with an imitation reward ({methods})",
+)
+ADVERSARIAL = Use(
+    lambda row: row.reward == "discriminator",
+    "methods with a discriminator ({methods}), unless imitation_reward is coherent",
+    lambda config: config.imitation_reward == "discriminator",
+)
 PENALIZED = Use(
     ADVERSARIAL.reads,
     "methods with a discriminator whose discriminator_regularizer is gradient_penalty",
-    lambda config: config.discriminator_regularizer == "gradient_penalty",
+    lambda config: ADVERSARIAL.where(config) and config.discriminator_regularizer == "gradient_penalty",
 )
 CONSTRAINED = Use(lambda row: row.limit is not None, "methods in which the cost enters ({methods})")
 STANDARDIZED = Use(
@@ -89,7 +97,10 @@ LAGRANGIAN_LOSS = Use(
 )
 CVAG = Use(lambda row: row.constraint == "alternating")
 GAUSSIAN = Use(lambda row: row.agent in ("on_policy", "behavior_cloning"), "methods with a Gaussian policy ({methods})")
-CLONING = Use(lambda row: GAUSSIAN.reads(row) and row.imitates, "methods that can begin with a clone ({methods})")
+CLONING = Use(
+    lambda row: row.imitates and row.agent in ("on_policy", "behavior_cloning", "iq_learn"),
+    "methods that can begin with a clone ({methods})",
+)
 CLONED = Use(
     lambda row: row.agent == "on_policy" and row.imitates,
     "{methods} whose cloning_updates are above 0",
@@ -97,7 +108,7 @@ CLONED = Use(
 )
 IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
 ACTOR = Use(
-    lambda row: row.agent == "iq_learn" or CLONING.reads(row),
+    CLONING.reads,
     "{methods}; an on-policy method only if its cloning_updates are above 0",
     lambda config: config.row.agent != "on_policy" or config.cloning_updates > 0,
 )

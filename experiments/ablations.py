@@ -59,6 +59,9 @@ QUESTIONS: Mapping[str, Question] = {
     "warmup_iterations": _after_cloning(
         "Do critics and discriminator need a start before the policy moves?", "warmup_iterations", (5, 0)
     ),
+    "imitation_reward": _after_cloning(
+        "Is the reward a discriminator's, or the clone's likelihood?", "imitation_reward", ("discriminator", "coherent")
+    ),
     "outer_loss": Question(
         "Which outer loss?",
         "malm",

@@ -277,7 +277,14 @@ CLONES = "used by methods that can begin with a clone"
             {"method": "expert", "cost_limit": 1.0, "cloning_updates": 100},
             f"cloning_updates 100: makes no difference to this run of method expert; leave it out .{CLONES}",
         ),
-        ({"method": "iq_learn", "cloning_updates": 100}, f"cloning_updates 100: makes no difference .*{CLONES}"),
+        (
+            {"method": "iq_learn", "cloning_updates": 100, "warmup_iterations": 3},
+            "warmup_iterations 3: makes no difference to this run of method iq_learn",
+        ),
+        (
+            {"method": "iq_learn", "cloning_updates": 100, "cloning_weight": 0.1},
+            "cloning_weight 0.1: makes no difference to this run of method iq_learn",
+        ),
         ({"method": "malm", "warmup_iterations": 3}, "warmup_iterations 3: makes no .*whose cloning_updates are above"),
         ({"method": "gail", "cloning_weight": 0.1}, "cloning_weight 0.1: makes no .*whose cloning_updates are above 0"),
         ({"method": "ccil", "actor_learning_rate": 0.1}, "actor_learning_rate 0.1: makes no difference"),

@@ -11,7 +11,7 @@ import scipy.integrate
 import scipy.stats
 
 from ccil_jax.acting import distributions
-from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
+from ccil_jax.acting.distributions import LARGEST_UNIT, CensoredGaussian, Gaussian, TanhGaussian
 from ccil_jax.agents import build, on_policy
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.types import Transition
@@ -57,6 +57,50 @@ def test_sample_scales_and_shifts_the_noise() -> None:
     sample = distributions.sample(gaussian(), jnp.array([[1.0, 0.0], [0.0, -2.0]]))
     expected = [[0.5 + np.exp(0.3), -1.0], [2.0, -2 * np.exp(-0.7)]]
     np.testing.assert_allclose(sample, expected, rtol=1e-6)
+
+
+def squashed(mean: Any, std: Any) -> TanhGaussian:
+    """Actions within [-1, 3], [2, 3], one Gaussian for each state."""
+    gaussian = Gaussian(mean=jnp.asarray(mean), log_std=jnp.log(jnp.asarray(std)))
+    return TanhGaussian(gaussian=gaussian, center=jnp.array([1.0, 2.5]), half_range=jnp.array([2.0, 0.5]))
+
+
+def test_the_likelihood_of_a_squashed_action_is_that_of_the_change_of_variables() -> None:
+    """Against SciPy, against quadrature, and against the density of a draw."""
+    with jax.enable_x64(True):
+        mean, std = np.array([[0.3, -0.8], [-1.0, 0.5]]), np.array([[0.5, 1.1], [0.9, 0.4]])
+        unit = np.array([[0.2, -0.9], [0.99, 0.0]])
+        action = np.array([1.0, 2.5]) + np.array([2.0, 0.5]) * unit
+        density = scipy.stats.norm.logpdf(np.arctanh(unit), mean, std) - np.log(1 - unit**2) - np.log([2.0, 0.5])
+        found = distributions.log_prob(squashed(mean, std), jnp.asarray(action))
+        np.testing.assert_allclose(found, density.sum(axis=-1), rtol=1e-10)
+
+        one = TanhGaussian(
+            gaussian=Gaussian(mean=jnp.array([[0.3]]), log_std=jnp.array([[-1.0]])),
+            center=jnp.array([1.0]),
+            half_range=jnp.array([2.0]),
+        )
+        total = scipy.integrate.quad(lambda a: np.exp(distributions.log_prob(one, jnp.array([[a]]))[0]), -1, 3)[0]
+        np.testing.assert_allclose(total, 1, rtol=1e-6)
+
+        noise = jnp.asarray([[0.4, -1.2], [-0.3, 0.1]])
+        drawn, likelihood = distributions.sample_unit(squashed(mean, std), noise)
+        action = np.array([1.0, 2.5]) + np.array([2.0, 0.5]) * np.asarray(drawn)
+        found = distributions.log_prob(squashed(mean, std), jnp.asarray(action))
+        np.testing.assert_allclose(found, likelihood - np.log(2.0 * 0.5), rtol=1e-8)
+
+
+def test_a_squashed_action_at_a_bound_counts_as_one_just_inside() -> None:
+    """Where its likelihood and the derivatives of that are finite."""
+    at, inside = (np.array([1.0, 2.5]) + np.array([2.0, 0.5]) * unit for unit in (1.0, LARGEST_UNIT))
+
+    def likelihood(mean: jax.Array, action: np.ndarray) -> jax.Array:
+        return distributions.log_prob(squashed(mean, [[0.5, 1.1]]), jnp.asarray(action, jnp.float32)[None])[0]
+
+    mean = jnp.array([[0.3, -0.8]])
+    found, slope = jax.value_and_grad(likelihood)(mean, at)
+    np.testing.assert_allclose(found, likelihood(mean, inside), rtol=1e-3)
+    np.testing.assert_allclose(slope, (np.arctanh(LARGEST_UNIT) - mean) / np.array([0.5, 1.1]) ** 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize("dimension", range(2))

@@ -1,5 +1,6 @@
 """IQ-Learn: its loss by hand, its expert data, what its critic and policy converge to, and its state on disk."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -7,14 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from ccil_jax.acting import networks
-from ccil_jax.agents import iq_learn
-from ccil_jax.agents.expert import expert_transitions
+from ccil_jax.acting.distributions import LARGEST_UNIT
+from ccil_jax.agents import behavior_cloning, iq_learn
+from ccil_jax.agents.expert import expert_data, expert_transitions
 from ccil_jax.agents.iq_learn import Minibatch
-from ccil_jax.config import Config
+from ccil_jax.config import CLONING_UPDATES_PER_ITERATION, Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.learning.optimizers import adam
 from ccil_jax.training import runner
+from envs.jax_tools import full_precision
 from tests.probe_envs import Walk, assert_same_bits, quick_compilation, same_bits, walk_config, walk_demonstrations
 
 
@@ -124,3 +129,71 @@ def test_it_learns_from_every_step(whole: runner.Result) -> None:
     assert np.abs(ring.action).max() <= 1  # squashed into the range
     assert all(np.isfinite(rows).all() for rows in whole.metrics.values())
     assert not same_bits(ring, jax.tree.map(lambda leaf: np.asarray(leaf[1]), whole.state.agent.replay))
+
+
+# The clone that it may begin with ------------------------------------------------------------------------------------
+
+
+def policy_key(key: jax.Array) -> jax.Array:
+    """The key of the first policy, from that of the agent."""
+    return jax.random.split(jax.random.split(key, 3)[1])[0]
+
+
+def test_the_first_policy_is_the_squashed_clone() -> None:
+    """Three iterations of behaviour cloning on observations as they are, to the last bit; then it learns as ever."""
+    updates = 2 * CLONING_UPDATES_PER_ITERATION + 1
+    config = iq_config(cloning_updates=updates, actor_learning_rate=1e-3, critic_minibatch_size=8)
+    expert, key = expert_data(walk_demonstrations()), jax.random.key(5)
+    assert expert is not None
+    policy = networks.make_squashed_policy(config, Walk())
+    agent = iq_learn.make(config, Walk(), expert)
+    cloning = behavior_cloning.descent(config, policy, expert, None, adam)
+    with quick_compilation():
+        state = jax.jit(full_precision(agent.init))(key)
+        learnt, step = jax.jit(full_precision(cloning.init))(policy_key(key)), jax.jit(full_precision(cloning.step))
+        actors = [learnt.actor]
+        for _ in range(3):
+            learnt, _ = step(learnt)
+            actors.append(learnt.actor)
+        after, metrics = jax.jit(full_precision(agent.step))(state)
+    assert_same_bits(state.actor, actors[3])
+    assert not same_bits(state.actor, actors[2])
+    assert state.actor.obs_statistics is None
+    assert not same_bits(after.actor, state.actor)
+    assert all(np.isfinite(value).all() for value in metrics.values())
+    # The likelihood that chose it is that of the held-out actions as they were executed, by SciPy.
+    gaussian = policy.apply(state.actor.policy_params, expert.held_out_obs).gaussian
+    unit = np.clip(np.asarray(expert.held_out_action, np.float64), -LARGEST_UNIT, LARGEST_UNIT)
+    density = scipy.stats.norm.logpdf(np.arctanh(unit), gaussian.mean, np.exp(gaussian.log_std)) - np.log(1 - unit**2)
+    np.testing.assert_allclose(learnt.held_out_loss, -np.mean(density.sum(axis=-1)), rtol=1e-4)
+
+
+def test_without_cloning_the_first_policy_is_a_random_one() -> None:
+    config, key = iq_config(), jax.random.key(4)
+    agent = iq_learn.make(config, Walk(), expert_data(walk_demonstrations()))
+    expected = networks.make_squashed_policy(config, Walk()).init(policy_key(key))
+    assert_same_bits(agent.init(key).actor.policy_params, expected)
+
+
+def test_the_squashed_clone_finds_the_expert() -> None:
+    """Actions tanh(0.1 + SLOPE . obs + 0.3 noise); observations far from standard, as the policy gets them raw."""
+    rng, slope = np.random.default_rng(0), np.array([0.5, -0.3])
+    obs = np.array([1.0, -2.0]) + rng.normal(size=(2000, 2))
+    middle = 0.1 + obs @ slope
+    actions = np.tanh(middle + 0.3 * rng.normal(size=2000))[:, None]
+    demonstrations = dataclasses.replace(
+        walk_demonstrations(),
+        obs=obs.astype(np.float32),
+        actions=actions.astype(np.float32),
+        costs=np.zeros(2000, np.float32),
+        terminated=np.zeros(2000, bool),
+        truncated=np.arange(2000) % 5 == 4,
+        episode_ends=np.arange(5, 2001, 5),
+    )
+    config = iq_config(cloning_updates=2000, actor_learning_rate=3e-3, critic_minibatch_size=64, hidden_sizes=(16,))
+    state = jax.jit(iq_learn.make(config, Walk(), expert_data(demonstrations)).init)(jax.random.key(0))
+    policy = networks.make_squashed_policy(config, Walk())
+    gaussian = policy.apply(state.actor.policy_params, jnp.asarray(obs, jnp.float32)).gaussian
+    usual = np.abs(obs - [1.0, -2.0]).max(axis=1) < 2
+    assert np.sqrt(np.mean((gaussian.mean[:, 0] - middle)[usual] ** 2)) < 0.05
+    np.testing.assert_allclose(np.exp(gaussian.log_std[usual]).mean(), 0.3, rtol=0.1)

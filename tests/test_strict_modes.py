@@ -43,7 +43,9 @@ LEARNERS: dict[str, dict[str, Any]] = {
         "multiplier_update": "sgd",
         "gap_unit": "limit",
     },
+    "the coherent reward": {"method": "ccil", "cloning_updates": 200, "imitation_reward": "coherent"},
     "iq_learn": {"method": "iq_learn", "critic_minibatch_size": 8},
+    "iq_learn from a clone": {"method": "iq_learn", "critic_minibatch_size": 8, "cloning_updates": 200},
     "expert": {"method": "expert", "cost_limit": 2.0},
 }
 # One robot of each kind, every aim, every sort of reward term.

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
+LARGEST_UNIT = 1 - 1e-3  # a squashed action nearer to a bound counts as one here: at the bound, atanh is infinite
+
 
 @struct.dataclass(kw_only=True)
 class Gaussian:
@@ -67,21 +69,32 @@ def sample_unit(
     The density is that of u: log N(x; mean, std) - log(1 - tanh(x)^2), summed over the entries of x = atanh(u).
     """
     raw = sample(distribution.gaussian, noise)
-    # log(1 - tanh(x)^2) in a form that loses no precision where tanh is close to 1 or -1
-    log_slope = 2 * (math.log(2) - raw - jax.nn.softplus(-2 * raw))
-    density = -0.5 * (noise**2 + math.log(2 * math.pi)) - distribution.gaussian.log_std - log_slope
+    density = _unit_log_density(noise, distribution.gaussian.log_std, raw)
     return jnp.tanh(raw), jnp.sum(density, axis=-1)
 
 
-def log_prob(distribution: Gaussian | CensoredGaussian, action: Float[Array, "... A"]) -> Float[Array, "..."]:
+def _unit_log_density(noise: jax.Array, log_std: jax.Array, raw: jax.Array) -> jax.Array:
+    """Log densities [..., A] of the entries of u = tanh(raw), where raw = mean + std * noise."""
+    # log(1 - tanh(x)^2) in a form that loses no precision where tanh is close to 1 or -1
+    log_slope = 2 * (math.log(2) - raw - jax.nn.softplus(-2 * raw))
+    return -0.5 * (noise**2 + math.log(2 * math.pi)) - log_std - log_slope
+
+
+def log_prob(
+    distribution: Gaussian | CensoredGaussian | TanhGaussian, action: Float[Array, "... A"]
+) -> Float[Array, "..."]:
     """Log likelihood of `action`, nats, summed over its entries; an action beyond a bound counts as one at the bound.
 
     It is the log density, and for an entry at a bound of a `CensoredGaussian` log Phi of the tail,
 
         log Phi((low - mean) / std)  and  log Phi((mean - high) / std).
+
+    An entry of a `TanhGaussian` that is nearer to a bound than a thousandth of the half range counts as one there.
     """
     if isinstance(distribution, CensoredGaussian):
         return _censored_log_prob(distribution, action)
+    if isinstance(distribution, TanhGaussian):
+        return _squashed_log_prob(distribution, action)
     standardized = (action - distribution.mean) * _wide(jnp.exp(-distribution.log_std), action)
     return -0.5 * jnp.sum(standardized**2 + math.log(2 * math.pi), axis=-1) - jnp.sum(distribution.log_std)
 
@@ -97,6 +110,14 @@ def _censored_log_prob(distribution: CensoredGaussian, action: jax.Array) -> jax
     # Added up as the Gaussian's are, so that without an entry at a bound the sum is the same to the last bit.
     quadratic = jnp.where(at_bound, -2 * tail, standardized**2 + math.log(2 * math.pi))
     return -0.5 * jnp.sum(quadratic, axis=-1) - jnp.sum(jnp.where(at_bound, 0.0, log_std), axis=-1)
+
+
+def _squashed_log_prob(distribution: TanhGaussian, action: jax.Array) -> jax.Array:
+    unit = (action - _wide(distribution.center, action)) / _wide(distribution.half_range, action)
+    raw = jnp.arctanh(jnp.clip(unit, -LARGEST_UNIT, LARGEST_UNIT))
+    noise = (raw - distribution.gaussian.mean) * jnp.exp(-distribution.gaussian.log_std)
+    density = _unit_log_density(noise, distribution.gaussian.log_std, raw)
+    return jnp.sum(density, axis=-1) - jnp.sum(jnp.log(distribution.half_range))
 
 
 def kl_divergence(old: Gaussian | CensoredGaussian, new: Gaussian | CensoredGaussian) -> Float[Array, "..."]:

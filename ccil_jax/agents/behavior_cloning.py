@@ -8,15 +8,17 @@ import optax
 from flax import struct
 
 from ccil_jax.acting import distributions, networks, running_statistics
-from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
-from ccil_jax.acting.networks import Policy
+from ccil_jax.acting.distributions import CensoredGaussian, Gaussian, TanhGaussian
+from ccil_jax.acting.networks import Policy, SquashedPolicy
 from ccil_jax.acting.rollout import Actor
+from ccil_jax.acting.running_statistics import RunningStatistics
 from ccil_jax.agents import contracts
 from ccil_jax.agents.base import Agent
 from ccil_jax.config import CLONING_UPDATES_PER_ITERATION, Config
 from ccil_jax.learning.optimizers import Optimizer, adam
 from ccil_jax.types import ExpertData, Metrics, PyTree
 from envs.base import Environment
+from envs.jax_tools import scan
 
 SMALLEST_LOG_STD = -4.0  # the likelihood of an action that the expert never varies has no maximum
 
@@ -33,7 +35,10 @@ class AgentState:
 
 
 def negative_log_likelihood(
-    apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian], params: PyTree, obs: jax.Array, action: jax.Array
+    apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian | TanhGaussian],
+    params: PyTree,
+    obs: jax.Array,
+    action: jax.Array,
 ) -> jax.Array:
     """Mean over the samples [M], nats."""
     return -jnp.mean(distributions.log_prob(apply(params, obs), action))
@@ -54,12 +59,44 @@ def make(
     policy: Policy | None = None,
     optimizer: Optimizer = adam,
 ) -> Agent:
-    """Builds the agent; an iteration is `CLONING_UPDATES_PER_ITERATION` gradient steps."""
+    """Builds the agent: the `descent` of a Gaussian policy, observations normalised by the demonstrations' moments."""
     assert expert is not None, "bc learns from demonstrations"
     own = contracts.policy(networks.policy_of(config, env) if policy is None else policy, env.action_dim)
-    policy = networks.with_likelihood(config, env, own)
-    apply, rule = policy.apply, optimizer(config.actor_learning_rate)
+    acting = networks.with_likelihood(config, env, own)
     statistics = running_statistics.update(running_statistics.init(env.obs_dim), expert.obs)
+    held_out_obs = running_statistics.normalize(statistics, expert.held_out_obs)
+    cloning = descent(config, acting, expert, statistics, optimizer)
+
+    def step(state: AgentState) -> tuple[AgentState, Metrics]:
+        new, metrics = cloning.step(state)
+        return new, metrics | {"entropy": distributions.entropy(acting.apply(new.actor.policy_params, held_out_obs))}
+
+    return Agent(cloning.init, step)
+
+
+def learn(cloning: Agent, num_iterations: int, key: jax.Array) -> Actor:
+    """The clone after so many iterations of `make` or `descent`: what was best on the held-out steps."""
+    state, _ = scan(lambda state, _: cloning.step(state), cloning.init(key), jnp.arange(num_iterations))
+    return state.actor
+
+
+def descent(
+    config: Config,
+    policy: Policy | SquashedPolicy,
+    expert: ExpertData,
+    statistics: RunningStatistics | None,
+    optimizer: Optimizer,
+) -> Agent:
+    """The cloning of any policy; an iteration is `CLONING_UPDATES_PER_ITERATION` gradient steps.
+
+    Args:
+        config: the learning rate and the size of a minibatch.
+        policy: with the likelihood that is to be maximised.
+        expert: the demonstrations; the held-out steps tell which parameters are kept.
+        statistics: of observations, to normalise what the policy gets; None where it gets them as they are.
+        optimizer: learning rate -> update rule.
+    """
+    apply, rule = policy.apply, optimizer(config.actor_learning_rate)
     obs = running_statistics.normalize(statistics, expert.obs)
     held_out_obs = running_statistics.normalize(statistics, expert.held_out_obs)
     minibatch_size = min(config.critic_minibatch_size, obs.shape[0])
@@ -101,7 +138,6 @@ def make(
             optimizer=optimizer_state,
             key=key,
         )
-        entropy = distributions.entropy(apply(best, held_out_obs))
-        return new, {"loss": jnp.mean(losses), "held_out_loss": held_out, "entropy": entropy}
+        return new, {"loss": jnp.mean(losses), "held_out_loss": held_out}
 
     return Agent(init, step)

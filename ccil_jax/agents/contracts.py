@@ -90,6 +90,7 @@ def reward_model(part: RewardModel) -> RewardModel:
     return part._replace(
         reward=reward,
         init=functools.partial(user_code.call, "reward_model.init", part.init),
+        begin=functools.partial(user_code.call, "reward_model.begin", part.begin),
         update=_updating("reward_model.update", part.update),
     )
 

@@ -1,7 +1,8 @@
 """IQ-Learn (Garg et al. 2021): a soft Q-function whose own Bellman residual is the reward, learnt off policy.
 
 SAC's networks and updates, but the critic's loss needs no reward: it raises r = Q(s, a) - y on the expert's steps and
-keeps r small everywhere by a chi-square term. Settings are those of the authors' published code.
+keeps r small everywhere by a chi-square term. Settings are those of the authors' published code. The policy may begin
+as a clone of the demonstrations (`cloning_updates`), which is no part of the published method.
 """
 
 import dataclasses
@@ -16,9 +17,9 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from ccil_jax.acting import distributions, networks, rollout
-from ccil_jax.acting.networks import Network
+from ccil_jax.acting.networks import Network, SquashedPolicy
 from ccil_jax.acting.rollout import Actor, RolloutState
-from ccil_jax.agents import contracts, replay
+from ccil_jax.agents import behavior_cloning, contracts, replay
 from ccil_jax.agents.base import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
 from ccil_jax.agents.replay import Replay
 from ccil_jax.config import Config
@@ -217,6 +218,8 @@ def make(
     assert expert is not None and expert.transitions is not None, "iq_learn learns from demonstrations"
     policy = networks.policy_of(config, env) if policy is None else policy
     policy = contracts.squashed_policy(policy, env.action_dim)
+    if config.cloning_updates:
+        policy = beginning_as_a_clone(config, policy, expert, optimizer)
     critic = networks.make_scalar(config, env.obs_dim + env.action_dim) if critic is None else critic
     critic = contracts.critic(critic)
     update = updates(config, policy, critic, env.action_dim, optimizer)
@@ -224,8 +227,24 @@ def make(
     return Agent(init=functools.partial(init, parts), step=functools.partial(step, parts))
 
 
+def beginning_as_a_clone(
+    config: Config, policy: SquashedPolicy, expert: ExpertData, optimizer: Optimizer
+) -> SquashedPolicy:
+    """The policy with the parameters that behaviour cloning learns in the place of random ones.
+
+    It is the most likely policy given the actions as they were executed, those near a bound of the range moved inwards
+    (`distributions.LARGEST_UNIT`). Observations are not normalised, as this agent's never are.
+    """
+    cloning = behavior_cloning.descent(config, policy, expert, None, optimizer)
+
+    def init(key: jax.Array) -> PyTree:
+        return behavior_cloning.learn(cloning, config.num_cloning_iterations, key).policy_params
+
+    return policy._replace(init=init)
+
+
 def init(parts: Parts, key: jax.Array) -> AgentState:
-    """An untrained agent whose simulations have begun. The key is consumed."""
+    """An agent before its first iteration, whose simulations have begun. The key is consumed."""
     config, env = parts.config, parts.env
     key, learner_key, env_key = jax.random.split(key, 3)
     capacity = config.replay_size // config.num_envs * config.num_envs

@@ -93,14 +93,15 @@ def make_parts(
     clone = None
     if config.reads("cloning_updates") and config.cloning_updates:
         clone = behavior_cloning.make(config, env, expert, policy=own, optimizer=optimizer)
+    acting = networks.with_likelihood(config, env, contracts.policy(own, env.action_dim))
+    if reward_model is None:
+        reward_model = reward_models.make(config, env, expert, optimizer, acting)
     return Parts(
         config=config,
         env=env,
-        policy=networks.with_likelihood(config, env, contracts.policy(own, env.action_dim)),
+        policy=acting,
         critic=contracts.critic(networks.make_critic(config, env, observed) if critic is None else critic),
-        reward_model=contracts.reward_model(
-            reward_models.make(config, env, expert, optimizer) if reward_model is None else reward_model
-        ),
+        reward_model=contracts.reward_model(reward_model),
         constraint=contracts.constraint(constraints.make(config) if constraint is None else constraint),
         optimizer=optimizer,
         expert=expert,
@@ -128,10 +129,11 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
     critic_params = jax.vmap(parts.critic.init)(jax.random.split(critic_key, 2))
     init_critic = functools.partial(regression.init, optimizer=parts.optimizer)
     zero = jnp.zeros(())
+    actor = first_actor(parts, policy_key)
     return AgentState(
-        actor=first_actor(parts, policy_key),
+        actor=actor,
         critics=jax.vmap(init_critic, in_axes=(0, None))(critic_params, config.critic_learning_rate),
-        reward_model=parts.reward_model.init(reward_key),
+        reward_model=parts.reward_model.begin(parts.reward_model.init(reward_key), actor),
         constraint=parts.constraint.init(),
         rollout=rollout.init(env, config.num_envs, env_key),
         estimates=EpisodeEstimates(episode_return=zero, episode_cost=parts.limit, episode_length=zero),
@@ -145,9 +147,7 @@ def first_actor(parts: Parts, key: jax.Array) -> Actor:
     """The policy before the first iteration: the clone where there is one, with the demonstrations' statistics."""
     if parts.clone is None:
         return Actor(policy_params=parts.policy.init(key), obs_statistics=running_statistics.init(parts.env.obs_dim))
-    clone, length = parts.clone, parts.config.num_cloning_iterations
-    state, _ = scan(lambda state, _: clone.step(state), clone.init(key), jnp.arange(length))
-    return state.actor
+    return behavior_cloning.learn(parts.clone, parts.config.num_cloning_iterations, key)
 
 
 def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
