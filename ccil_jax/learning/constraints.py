@@ -34,6 +34,11 @@ class Multiplier:
     outer_optimizer: PyTree  # of the outer step
 
 
+def no_likelihood(multiplier: jax.Array) -> jax.Array:
+    """[] of a policy step in which the demonstrations' likelihood is no objective."""
+    return jnp.zeros_like(multiplier)
+
+
 @struct.dataclass(kw_only=True)
 class Outer:
     """The outer (validation) loss of MALM on V held-out samples."""
@@ -44,6 +49,8 @@ class Outer:
     importance_weights: Callable[[jax.Array], jax.Array] = struct.field(
         pytree_node=False
     )  # lambda -> pi_theta'(lambda)(a|s) / pi_theta_k(a|s), [V]
+    # lambda -> [] the demonstrations' mean log likelihood under pi_theta'(lambda), times its weight in the policy step
+    likelihood: Callable[[jax.Array], jax.Array] = struct.field(pytree_node=False, default=no_likelihood)
 
 
 @struct.dataclass(kw_only=True)
@@ -188,13 +195,15 @@ def lagrangian_gradient(multiplier: Float[Array, ""], weight: Float[Array, ""], 
     `weight` is that of the augmented Lagrangian (Hestenes 1969, Powell 1969), max(0, lambda' + rho e) with the relative
     gap e = (J_k - J_E) / J_E. A step along x_r - lambda x_c changes with lambda along -x_c, so on the samples of the
     step itself the gradient is proportional to lambda - weight: descent takes lambda to a value that weighs the cost
-    as the gap demands. Where no step changes the cost, the gradient is 0 and lambda stays. This is exact where the step
-    follows reward and cost alone; the demonstrations' likelihood, where it is an objective too, is not in the loss.
+    as the gap demands. Where no step changes the cost, the gradient is 0 and lambda stays. Where the demonstrations'
+    likelihood is an objective of the step, it is one of the loss too. Without it a larger lambda would always look
+    better, because it leaves less of the step's length to the likelihood.
     """
 
     def loss(multiplier: jax.Array) -> jax.Array:
         weights = outer.importance_weights(multiplier)
-        return lagrangian_loss(weights, outer.reward_advantage, outer.cost_advantage, weight)
+        surrogate = lagrangian_loss(weights, outer.reward_advantage, outer.cost_advantage, weight)
+        return surrogate - outer.likelihood(multiplier)
 
     return jax.jvp(loss, (multiplier,), (jnp.ones_like(multiplier),))[1]
 

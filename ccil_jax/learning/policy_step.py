@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from ccil_jax.acting import distributions
 from ccil_jax.acting.distributions import CensoredGaussian, Gaussian
 from ccil_jax.config import Config
-from ccil_jax.learning import trust_region
+from ccil_jax.learning import constraints, trust_region
 from ccil_jax.learning.constraints import Constraint, Outer
 from ccil_jax.learning.minibatches import permutation
 from ccil_jax.learning.trust_region import Directions
@@ -30,6 +30,7 @@ class PolicyStep:
     fraction: jax.Array  # [] of the full step that the line search accepted; 0 if it rejected the step
     step_gap: jax.Array  # [] J_k - J_E per step, when it was taken
     held_out: Batch  # [V]
+    expert: "ExpertSteps | None" = None  # whose likelihood was an objective of the step
 
 
 @struct.dataclass(kw_only=True)
@@ -115,7 +116,12 @@ def improve(
     # that also where they were not finite, because 0 times NaN is NaN.
     replayed = jax.tree.map(lambda leaf: jnp.where(fraction > 0, leaf, 0.0), directions)
     taken = PolicyStep(
-        policy_params=policy_params, directions=replayed, fraction=fraction, step_gap=step_gap, held_out=held_out
+        policy_params=policy_params,
+        directions=replayed,
+        fraction=fraction,
+        step_gap=step_gap,
+        held_out=held_out,
+        expert=expert,
     )
     return unravel(new_params), taken, metrics | {"cost_weight": -weights[1]}
 
@@ -143,21 +149,29 @@ def outer_problem(
     constraint: Constraint,
     taken: PolicyStep,
 ) -> Outer:
-    """The held-out samples, with the importance weights that the step would have had under another multiplier."""
-    held_out = taken.held_out
+    """The held-out samples, and what the step would have been worth on them under another multiplier."""
+    held_out, expert = taken.held_out, taken.expert
     old_params, unravel = ravel_pytree(taken.policy_params)
 
     def log_prob(params: jax.Array) -> jax.Array:
         return distributions.log_prob(policy_apply(unravel(params), held_out.obs), held_out.action)
 
-    def importance_weights(multiplier: jax.Array) -> jax.Array:
+    def stepped(multiplier: jax.Array) -> jax.Array:
         weights = _weights(config, constraint, multiplier, taken.step_gap, taken.directions.gram)
-        new_params = trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
-        return importance(log_prob(new_params), log_prob(old_params))
+        return trust_region.propose(old_params, taken.directions, weights, config.max_kl, taken.fraction)
+
+    def importance_weights(multiplier: jax.Array) -> jax.Array:
+        return importance(log_prob(stepped(multiplier)), log_prob(old_params))
+
+    def likelihood(multiplier: jax.Array) -> jax.Array:
+        assert expert is not None
+        cloned = policy_apply(unravel(stepped(multiplier)), expert.obs)
+        return config.cloning_weight * jnp.mean(distributions.log_prob(cloned, expert.action))
 
     return Outer(
         reward_advantage=held_out.reward_advantage,
         cost_advantage=held_out.cost_advantage,
         cost=held_out.cost,
         importance_weights=importance_weights,
+        likelihood=constraints.no_likelihood if expert is None else likelihood,
     )
