@@ -54,7 +54,7 @@ QUESTIONS: Mapping[str, Question] = {
         "Is an action at a bound taken for all draws beyond it?", "action_likelihood", ("censored", "gaussian")
     ),
     "cloning_weight": _after_cloning(
-        "How much do the demonstrations weigh in the policy's objective?", "cloning_weight", (1.0, 0.0, 0.1, 0.3, 3.0)
+        "How much do the demonstrations weigh in the policy's objective?", "cloning_weight", (3.0, 0.0, 0.3, 1.0, 10.0)
     ),
     "warmup_iterations": _after_cloning(
         "Do critics and discriminator need a start before the policy moves?", "warmup_iterations", (5, 0)
