@@ -132,6 +132,25 @@ def test_a_multiplier_that_an_earlier_version_logged_is_left_out(
     assert "multiplier" not in result.metrics
 
 
+def test_a_metric_that_an_earlier_version_did_not_have_is_unknown_for_its_iterations(
+    several: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(several, tmp_path / "copy")
+    restore, name = runner._restore, "cost_critic_explained_variance"
+
+    def older(*arguments: Any) -> Any:
+        state, history = restore(*arguments)
+        return state, {other: rows for other, rows in history.items() if other != name}
+
+    monkeypatch.setattr(runner, "_restore", older)
+    result, _ = train_several(tmp_path / "copy", resume=True, stop_after=2)
+    explained = result.metrics[name]
+    done = len(explained) - 1
+    assert done >= 1
+    assert np.isnan(explained[:done]).all()
+    assert np.isfinite(explained[done:]).all()
+
+
 def other_demonstrations() -> Demonstrations:
     same = walk_demonstrations()
     return dataclasses.replace(same, actions=-same.actions)
