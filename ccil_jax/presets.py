@@ -12,8 +12,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # gradient steps the discriminator separates the classes completely where that is easy (HalfCheetah), and its reward
     # no longer tells better from worse. So it has a gradient penalty.
     "paper": {},
-    # Begins with a clone and keeps the demonstrations in the policy's objective, so that it is never worse than the
-    # clone; the simulator adds what cloning cannot know (docs/ablations.md). Critics that see sharp edges, with targets
+    # Begins with a clone and keeps the demonstrations in the policy's objective, so that little of the clone is lost;
+    # the simulator adds what cloning cannot know (docs/ablations.md). Critics that see sharp edges, with targets
     # of their own, let the cost's advantages lean on them: without that no multiplier lowered the cost of PointGoal1.
     # Gaps relative to the limit and cost advantages of unit deviation let one multiplier rate suit tasks of any cost.
     "default": {

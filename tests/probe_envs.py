@@ -5,6 +5,7 @@ They implement the contract of `envs.base` in plain JAX, so a whole training pro
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,11 +16,14 @@ import numpy as np
 import scipy.stats
 
 from ccil_jax.acting import networks
+from ccil_jax.agents import on_policy
+from ccil_jax.agents.base import Agent
+from ccil_jax.agents.on_policy import Parts
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
-from ccil_jax.types import Batch, PyTree
+from ccil_jax.types import Batch, PyTree, Transition
 from envs.base import State, first_state, next_state
-from envs.jax_tools import as_numbers
+from envs.jax_tools import as_numbers, full_precision
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -298,3 +302,30 @@ def assert_same_bits(a: PyTree, b: PyTree) -> None:
 def _same_leaf(one: Any, other: Any) -> bool:
     x, y = (np.asarray(as_numbers(leaf) if isinstance(leaf, jax.Array) else leaf) for leaf in (one, other))
     return x.dtype == y.dtype and x.shape == y.shape and x.tobytes() == y.tobytes()
+
+
+def steps_to_judge(obs: Any, action: Any, *, reward: float) -> Transition:
+    """[T, N] steps of which a reward model reads observations and actions, and no successor."""
+    obs, action = jnp.asarray(obs, jnp.float32), jnp.asarray(action, jnp.float32)
+    zeros = jnp.zeros(obs.shape[:2])
+    return Transition(
+        obs=obs,
+        next_obs=jnp.full_like(obs, jnp.nan),
+        action=action,
+        reward=jnp.full_like(zeros, reward),
+        cost=zeros,
+        terminated=zeros > 0,
+        done=zeros > 0,
+        whole=zeros == 0,
+        episode_return=zeros,
+        episode_cost=zeros,
+        episode_length=zeros.astype(jnp.int32),
+    )
+
+
+def agent_of(parts: Parts) -> Agent:
+    """The on-policy agent of these parts, each of its two functions compiled, with a training's precision."""
+    return Agent(
+        init=jax.jit(full_precision(functools.partial(on_policy.init, parts))),
+        step=jax.jit(full_precision(functools.partial(on_policy.step, parts))),
+    )

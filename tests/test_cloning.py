@@ -1,7 +1,6 @@
 """Methods that begin with a clone: where it comes from, how long it is held, the demonstrations in the policy step."""
 
 import dataclasses
-import functools
 import itertools
 from typing import Any
 
@@ -25,6 +24,7 @@ from envs.jax_tools import full_precision
 from tests.probe_envs import (
     PolicyProblem,
     Walk,
+    agent_of,
     assert_same_bits,
     numpy_log_prob,
     policy_problem,
@@ -45,13 +45,6 @@ def parts_of(method: str, **changes: Any) -> Parts:
     demonstrations = walk_demonstrations()
     config = build.resolve(walk_config(method=method, **changes), Walk(), demonstrations)
     return on_policy.make_parts(config, Walk(), expert_data(demonstrations))
-
-
-def agent_of(parts: Parts) -> Agent:
-    return Agent(
-        init=jax.jit(full_precision(functools.partial(on_policy.init, parts))),
-        step=jax.jit(full_precision(functools.partial(on_policy.step, parts))),
-    )
 
 
 # The clone -----------------------------------------------------------------------------------------------------------

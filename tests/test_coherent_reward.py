@@ -1,7 +1,6 @@
 """The coherent reward: the log-likelihood ratio of clone and prior, which stays as it is while a policy learns."""
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from ccil_jax.acting import networks, running_statistics
 from ccil_jax.acting.distributions import Gaussian
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.agents import build, on_policy
-from ccil_jax.agents.base import Agent
 from ccil_jax.agents.expert import expert_data
 from ccil_jax.agents.on_policy import Parts
 from ccil_jax.config import Config, validate
@@ -24,14 +22,15 @@ from ccil_jax.errors import ConfigError
 from ccil_jax.learning import policy_step, reward_models
 from ccil_jax.training import runner
 from ccil_jax.types import Transition
-from envs.jax_tools import full_precision
 from tests.probe_envs import (
     Walk,
+    agent_of,
     assert_same_bits,
     gae_by_loop,
     numpy_policy,
     quick_compilation,
     same_bits,
+    steps_to_judge,
     walk_config,
     walk_demonstrations,
 )
@@ -46,32 +45,12 @@ def parts_of(env: Walk, method: str, **changes: Any) -> Parts:
     return on_policy.make_parts(config, env, expert_data(demonstrations))
 
 
-def agent_of(parts: Parts) -> Agent:
-    return Agent(
-        init=jax.jit(full_precision(functools.partial(on_policy.init, parts))),
-        step=jax.jit(full_precision(functools.partial(on_policy.step, parts))),
-    )
-
-
 def steps_of(env: Walk) -> Transition:
     """[6, 4] steps whose actions lie within the range, at its bounds and, the last ones, beyond it."""
     rng = np.random.default_rng(1)
     action = np.clip(rng.normal(0, 0.5, (6, 4, 1)), env.action_low, env.action_high)
     action[-1] *= 3
-    zeros = jnp.zeros((6, 4))
-    return Transition(
-        obs=jnp.asarray(rng.normal(0, 2, (6, 4, 2)), jnp.float32),
-        next_obs=jnp.full((6, 4, 2), jnp.nan),
-        action=jnp.asarray(action, jnp.float32),
-        reward=jnp.full((6, 4), jnp.nan),
-        cost=zeros,
-        terminated=zeros > 0,
-        done=zeros > 0,
-        whole=zeros == 0,
-        episode_return=zeros,
-        episode_cost=zeros,
-        episode_length=zeros.astype(jnp.int32),
-    )
+    return steps_to_judge(rng.normal(0, 2, (6, 4, 2)), action, reward=np.nan)
 
 
 def numpy_likelihood(mean: Any, std: Any, action: np.ndarray, bound: float) -> np.ndarray:

@@ -92,7 +92,8 @@ def test_the_critics_range_is_that_of_the_demonstrations(method: str) -> None:
     if method == "trpo":
         low, high = -running_statistics.CLIP, running_statistics.CLIP
     else:
-        obs = expert_data(walk_demonstrations()).obs  # type: ignore[union-attr]
+        assert parts.expert is not None
+        obs = parts.expert.obs
         z = (obs[:, 0] - obs[:, 0].mean()) / obs[:, 0].std()
         low, high = min(float(z.min()), -1.0), max(float(z.max()), 1.0)
     middle = (low + high) / 2

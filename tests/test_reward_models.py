@@ -14,28 +14,14 @@ from ccil_jax.config import CHOICES, Config
 from ccil_jax.learning import reward_models
 from ccil_jax.learning.reward_models import Discriminator, RewardModel
 from ccil_jax.types import ExpertData, Metrics, Transition
-from tests.probe_envs import same_bits
+from tests.probe_envs import same_bits, steps_to_judge
 
 LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([1.0, 2.0], np.float32)
 
 
 def transition(obs: Any, action: Any) -> Transition:
     """[T, N] steps of which a reward model reads observations and actions."""
-    obs, action = jnp.asarray(obs, jnp.float32), jnp.asarray(action, jnp.float32)
-    zeros = jnp.zeros(obs.shape[:2])
-    return Transition(
-        obs=obs,
-        next_obs=obs,
-        action=action,
-        reward=zeros + 3.0,
-        cost=zeros,
-        terminated=zeros > 0,
-        done=zeros > 0,
-        whole=zeros == 0,
-        episode_return=zeros,
-        episode_cost=zeros,
-        episode_length=zeros.astype(jnp.int32),
-    )
+    return steps_to_judge(obs, action, reward=3.0)
 
 
 def samples(center: float, seed: int, num_steps: int = 16, num_envs: int = 4) -> tuple[np.ndarray, np.ndarray]:

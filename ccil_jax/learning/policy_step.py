@@ -22,6 +22,14 @@ from ccil_jax.types import Batch, Metrics, PyTree
 
 
 @struct.dataclass(kw_only=True)
+class ExpertSteps:
+    """Steps of the demonstrations, whose likelihood is an objective of the policy step."""
+
+    obs: jax.Array  # [M, obs_dim] normalised
+    action: jax.Array  # [M, action_dim]
+
+
+@struct.dataclass(kw_only=True)
 class PolicyStep:
     """What is needed to carry out a policy step again under another multiplier, and to differentiate it."""
 
@@ -30,15 +38,7 @@ class PolicyStep:
     fraction: jax.Array  # [] of the full step that the line search accepted; 0 if it rejected the step
     step_gap: jax.Array  # [] J_k - J_E per step, when it was taken
     held_out: Batch  # [V]
-    expert: "ExpertSteps | None" = None  # whose likelihood was an objective of the step
-
-
-@struct.dataclass(kw_only=True)
-class ExpertSteps:
-    """Steps of the demonstrations, whose likelihood is an objective of the policy step."""
-
-    obs: jax.Array  # [M, obs_dim] normalised
-    action: jax.Array  # [M, action_dim]
+    expert: ExpertSteps | None = None  # whose likelihood was an objective of the step
 
 
 def random_order(config: Config, key: jax.Array) -> jax.Array:

@@ -33,15 +33,11 @@ def make(robot: Robot, actuators: Sequence[str], num_lidars: int) -> Mirror:
     if robot.ball is not None:
         parts.append(("ball", np.outer(flip, flip).ravel()))  # M R M of a rotation R and the reflection M
     parts += [(name, np.ones(2)) for name in robot.hinges]
-    parts += [("lidar", np.ones(NUM_BINS))] * num_lidars
-    obs_index = _exchanged([(name, len(signs)) for name, signs in parts], robot)
+    own = _exchanged([(name, len(signs)) for name, signs in parts], robot)
     bins = _mirrored_bins(robot.lateral)
-    for i in range(num_lidars):
-        block = slice(len(obs_index) - NUM_BINS * (i + 1), len(obs_index) - NUM_BINS * i)
-        obs_index[block] = obs_index[block][bins]
     return Mirror(
-        obs_index=obs_index,
-        obs_sign=np.concatenate([signs for _, signs in parts]),
+        obs_index=np.concatenate([own, *(len(own) + NUM_BINS * i + bins for i in range(num_lidars))]),
+        obs_sign=np.concatenate([*(signs for _, signs in parts), np.ones(NUM_BINS * num_lidars)]),
         action_index=_exchanged([(name, 1) for name in actuators], robot),
         action_sign=np.array([-1.0 if name in robot.turning else 1.0 for name in actuators]),
     )

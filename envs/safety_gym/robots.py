@@ -183,13 +183,14 @@ def _build_doggo(root: mujoco.MjsBody, style: Style) -> None:
     _build_leg(rear, 3, style)
 
 
-_DOGGO_HINGES = tuple(f"{kind.format(leg)}" for kind in ("hip_{}_z", "hip_{}_y", "ankle_{}") for leg in LEGS)
+_HINGES_OF_A_LEG = ("hip_{}_z", "hip_{}_y", "ankle_{}")
+_DOGGO_HINGES = tuple(hinge.format(leg) for hinge in _HINGES_OF_A_LEG for leg in LEGS)
 
 
 def _doggo_counterparts() -> dict[str, str]:
     """What belongs to a left leg and what belongs to the right leg at the same end."""
-    hinges = ("hip_{}_z", "hip_{}_y", "ankle_{}")
-    names = (*hinges, *(f"velocity_{hinge}" for hinge in hinges), "touch_{}a", "touch_{}b")
+    velocities = (f"velocity_{hinge}" for hinge in _HINGES_OF_A_LEG)
+    names = (*_HINGES_OF_A_LEG, *velocities, "touch_{}a", "touch_{}b")
     return {name.format(leg): name.format(LEGS[-1 - i]) for name in names for i, leg in enumerate(LEGS)}
 
 
