@@ -134,13 +134,31 @@ class Environment(Protocol):
 class Mirror:
     """A mirror symmetry of a task: a step seen in a mirror is a step of the same task.
 
-    Entry i of a mirrored array is `sign[i]` times entry `index[i]` of the array itself. Doing it twice changes nothing.
+    Entry i of a mirrored array is `sign[i]` times entry `index[i]` of the array itself. Doing it twice changes nothing,
+    so `index` names every place once, and two places that change with each other have the same sign.
+
+    Raises:
+        ValueError: the places or the signs are not such.
     """
 
     obs_index: np.ndarray  # [obs_dim] int
     obs_sign: np.ndarray  # [obs_dim] 1 or -1
     action_index: np.ndarray  # [action_dim] int
     action_sign: np.ndarray  # [action_dim] 1 or -1
+
+    def __post_init__(self) -> None:
+        for name in ("obs", "action"):
+            index, sign = np.asarray(getattr(self, f"{name}_index")), np.asarray(getattr(self, f"{name}_sign"))
+            if not (index.ndim == 1 and np.array_equal(np.sort(index), np.arange(len(index)))):
+                raise ValueError(f"mirror: {name}_index must name every place from 0 to its length less 1 once")
+            check_shape(f"mirror: {name}_sign", sign, index.shape)
+            if not np.all(np.abs(sign) == 1):
+                raise ValueError(f"mirror: {name}_sign must consist of 1 and -1")
+            if np.any(index[index] != np.arange(len(index))) or np.any(sign[index] != sign):
+                raise ValueError(
+                    f"mirror: the image of the image of {name} is not {name} itself; give places that change with each "
+                    "other each other's index, and the same sign"
+                )
 
     def obs(self, obs: Any) -> Any:
         """Mirrored observations, [..., obs_dim], NumPy's or JAX's as they are given."""
@@ -152,8 +170,18 @@ class Mirror:
 
 
 def mirror_of(env: Environment) -> Mirror | None:
-    """The mirror symmetry that a task declares as its attribute `mirror`; None where it declares none."""
-    mirror: Mirror | None = getattr(env, "mirror", None)
+    """The mirror symmetry that a task declares as its attribute `mirror`; None where it declares none.
+
+    Raises:
+        ValueError: it is no `Mirror`, or one of other lengths than the task's observations and actions.
+    """
+    mirror = getattr(env, "mirror", None)
+    if mirror is None:
+        return None
+    if not isinstance(mirror, Mirror):
+        raise ValueError(f"{env.name}: mirror is of type {type(mirror).__name__}; give an envs.base.Mirror or None")
+    check_shape(f"{env.name}: mirror.obs_index", mirror.obs_index, (env.obs_dim,))
+    check_shape(f"{env.name}: mirror.action_index", mirror.action_index, (env.action_dim,))
     return mirror
 
 

@@ -1,5 +1,7 @@
 """Mirror symmetries that tasks declare, against the physics: a step of the mirrored world is the mirrored step."""
 
+from typing import Any
+
 import jax
 import mujoco
 import numpy as np
@@ -10,6 +12,7 @@ from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_of
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
+from ccil_jax.errors import ConfigError
 from ccil_jax.types import ExpertData
 from envs.base import Mirror, mirror_of
 from envs.safety_gym.environment import SafetyGym
@@ -111,6 +114,42 @@ def test_two_mirrors_change_nothing_and_one_does(name: str) -> None:
 def test_no_symmetry_is_declared_where_none_is_known(name: str) -> None:
     """Gremlins circle to one side, so a button task in the mirror is another task."""
     assert mirror_of(envs.make(name)) is None
+
+
+def mirror_with(**changes: list[int]) -> Mirror:
+    fields = {"obs_index": [1, 0, 2], "obs_sign": [1, 1, -1], "action_index": [0], "action_sign": [-1]} | changes
+    return Mirror(**{name: np.array(value) for name, value in fields.items()})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"obs_index": [1, 1, 2]}, "obs_index must name every place"),
+        ({"obs_index": [1, 0, 3]}, "obs_index must name every place"),
+        ({"obs_sign": [1, 1]}, r"obs_sign must have shape \(3,\)"),
+        ({"action_sign": [0]}, "action_sign must consist of 1 and -1"),
+        ({"obs_sign": [1, -1, 1]}, "the image of the image of obs"),
+        ({"obs_index": [1, 2, 0]}, "the image of the image of obs"),
+    ],
+)
+def test_what_is_no_mirror_is_refused(changes: dict[str, list[int]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        mirror_with(**changes)
+
+
+@pytest.mark.parametrize(
+    ("mirror", "message"),
+    [(mirror_with(), r"Swimmer: mirror.obs_index must have shape \(8,\)"), ("left", "Swimmer: mirror is of type str")],
+)
+def test_a_mirror_that_does_not_fit_the_task_is_refused_before_anything_is_trained(mirror: Any, message: str) -> None:
+    class Mirrored(type(envs.make("Swimmer"))):  # type: ignore[misc]
+        pass
+
+    env = envs.make("Swimmer")
+    env.__class__ = Mirrored
+    Mirrored.mirror = mirror
+    with pytest.raises(ConfigError, match=message):
+        build.resolve(Config(), env, random_demonstrations("Swimmer"))
 
 
 # As demonstrations ---------------------------------------------------------------------------------------------------

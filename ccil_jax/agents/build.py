@@ -15,7 +15,7 @@ from ccil_jax.learning.constraints import Constraint
 from ccil_jax.learning.optimizers import Optimizer
 from ccil_jax.learning.reward_models import RewardModel
 from ccil_jax.types import ExpertData
-from envs.base import Environment
+from envs.base import Environment, mirror_of
 from envs.jax_tools import full_precision
 
 
@@ -142,6 +142,10 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
                 found = f"{array.shape[1]} columns" if array.ndim == 2 else f"shape {array.shape}, no rows,"
                 raise ConfigError(f"demonstrations: {name} has {found} but {env.name} has {size}")
         check_time_limit(demonstrations, "demonstrations", env.max_episode_steps)
+        try:
+            mirror_of(env)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
     if demonstrations is None:
         return config
     config = with_limit_of(config, demonstrations.mean_episode_cost)
