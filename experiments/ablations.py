@@ -142,6 +142,7 @@ COLUMNS = {
     "question": "question",
     "answer": "answer",
     "recovered_return": "recovered return, %",
+    "episode_cost": "cost",
     "relative_cost_violation": "relative violation",
     "final_multiplier": "final lambda",
     "max_multiplier": "highest",
