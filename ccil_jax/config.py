@@ -20,6 +20,7 @@ from ccil_jax.uses import (
     ADVERSARIAL,
     ALL,
     ASCENT,
+    AVERAGED,
     CLONED,
     CLONING,
     CONSTRAINED,
@@ -61,6 +62,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "reward_form": ("softplus", "logit", "log_sigmoid"),
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "critic_target": ("gae", "td_lambda"),
+    "policy_average": ("none", "polynomial_decay"),
     "mirrored_demonstrations": ("none", "symmetric_tasks"),
     "value_loss": ("value", "v0"),
 }
@@ -186,6 +188,12 @@ class Config:
         5, "every n-th sample of the batch enters the products with the Fisher matrix (authors)"
     )
     line_search_steps: int = _static(10, "halvings of the policy step before it is rejected (authors)")
+    policy_average: str = _static(
+        "none",
+        "what is evaluated and recorded in the end: none is the policy of the last iteration, polynomial_decay the "
+        "average of the parameters of all iterations, those of iteration k weighed by k^policy_average_power, so that "
+        "the noise of single steps cancels (Shamir and Zhang 2013); rollouts are of the newest policy either way",
+    )
     critic_intervals: int = _static(
         0,
         "equal intervals into which the range of each observation entry is divided for the critics, which then tell "
@@ -257,6 +265,11 @@ class Config:
         0.97, "lambda of generalised advantage estimation, for the cost (Table 1)", CONSTRAINED
     )
     critic_lambda: float = _traced(0.97, "lambda of the critics' targets", TD_LAMBDA)
+    policy_average_power: float = _traced(
+        6.0,
+        "how fast older policies fade from the average; with n about the last 1/(n+1) of the iterations count",
+        AVERAGED,
+    )
     max_kl: float = _traced(0.01, "radius of the trust region: KL divergence from the old policy, nats (Table 1)")
     kl_tolerance: float = _traced(
         1.5, "the line search accepts a step whose KL divergence is at most this multiple of max_kl (authors)"

@@ -33,6 +33,7 @@ class Fields(TypedDict, total=False):
     cg_iterations: int
     fisher_stride: int
     line_search_steps: int
+    policy_average: str
     critic_intervals: int
     critic_target: str
     critic_epochs: int
@@ -51,6 +52,7 @@ class Fields(TypedDict, total=False):
     gae_lambda: float
     cost_gae_lambda: float
     critic_lambda: float
+    policy_average_power: float
     max_kl: float
     kl_tolerance: float
     cg_damping: float

@@ -15,7 +15,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # Begins with a clone and keeps the demonstrations in the policy's objective, so that little of the clone is lost;
     # the simulator adds what cloning cannot know (docs/ablations.md). Critics that see sharp edges, with targets
     # of their own, let the cost's advantages lean on them: without that no multiplier lowered the cost of PointGoal1.
-    # Gaps relative to the limit and cost advantages of unit deviation let one multiplier rate suit tasks of any cost.
+    # An average of the policies is judged, in which the noise of single steps cancels. Gaps relative to the limit and
+    # cost advantages of unit deviation let one multiplier rate suit tasks of any cost.
     "default": {
         "env_steps": 300_000,
         "batch_size": 4000,
@@ -23,6 +24,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "gamma": 0.99,
         "gae_lambda": 0.95,
         "cost_gae_lambda": 0.5,
+        "policy_average": "polynomial_decay",
         "critic_intervals": 16,
         "critic_target": "td_lambda",
         "mirrored_demonstrations": "symmetric_tasks",

@@ -44,6 +44,11 @@ TD_LAMBDA = Use(
     "on-policy methods whose critic_target is td_lambda",
     lambda config: config.critic_target == "td_lambda",
 )
+AVERAGED = Use(
+    ON_POLICY.reads,
+    "on-policy methods whose policy_average is polynomial_decay",
+    lambda config: config.policy_average == "polynomial_decay",
+)
 IMITATING = Use(lambda row: row.imitates, "every method that imitates ({methods})")
 IMITATION = Use(
     lambda row: row.agent == "on_policy" and row.reward == "discriminator",

@@ -80,6 +80,9 @@ QUESTIONS: Mapping[str, Question] = {
             "cost, 0.0005": {"multiplier_update": "sgd", "gap_unit": "cost", "multiplier_learning_rate": 0.0005},
         },
     ),
+    "policy_average": _one_field(
+        "Is what is judged the average of the policies?", "policy_average", ("polynomial_decay", "none")
+    ),
     "critic_intervals": _one_field("Do critics see observations in intervals?", "critic_intervals", (16, 0)),
     "critic_target": _one_field(
         "Have the critics' targets a lambda of their own?", "critic_target", ("td_lambda", "gae")

@@ -39,6 +39,7 @@ VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHOD
     "ccil that begins with a clone": {"method": "ccil", "cloning_updates": 200},
     "gail that begins with a clone": {"method": "gail", "cloning_updates": 200},
     "gail with targets of their own": {"method": "gail", "critic_target": "td_lambda"},
+    "gail that averages": {"method": "gail", "policy_average": "polynomial_decay"},
     "iq_learn that begins with a clone": {"method": "iq_learn", "cloning_updates": 200},
     "malm with the coherent reward": {"method": "malm", "cloning_updates": 200, "imitation_reward": "coherent"},
     "gail with the coherent reward": {"method": "gail", "cloning_updates": 200, "imitation_reward": "coherent"},
@@ -72,6 +73,7 @@ OTHER: dict[str, Any] = {  # another value of each static field that narrows wha
     "cloning_updates": 300,
     "warmup_iterations": 2,
     "critic_target": "td_lambda",
+    "policy_average": "polynomial_decay",
 }
 # How long, when to give up, and what the demonstrations are: not of an iteration.
 OUTSIDE = {"env_steps", "max_skipped_updates", "mirrored_demonstrations"}

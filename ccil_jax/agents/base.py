@@ -50,6 +50,17 @@ def running_mean(mean: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array
     return mean + (new - mean) / count.astype(mean.dtype)
 
 
+def polynomial_decay_mean(mean: jax.Array, new: jax.Array, *, count: jax.Array, power: jax.Array | float) -> jax.Array:
+    """A mean in which value k weighs about k^power; `new` is value `count`, and `mean` that of the values before it.
+
+    The weight is exactly k (k + 1) ... (k + power - 1), which is 1 for power 0. Whatever their number, about the last
+    1/(power + 1) of the values make up the mean, so nobody has to say beforehand how many there will be
+    (Shamir and Zhang 2013, polynomial-decay averaging).
+    """
+    share = (power + 1) / (count.astype(mean.dtype) + power)
+    return mean + (new - mean) * share
+
+
 def episode_metrics(estimates: EpisodeEstimates, cost_rate: jax.Array) -> Metrics:
     """What every agent that acts reports."""
     return {

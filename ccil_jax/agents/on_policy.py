@@ -16,7 +16,14 @@ from ccil_jax.acting import distributions, networks, rollout, running_statistics
 from ccil_jax.acting.networks import Network, Policy
 from ccil_jax.acting.rollout import Actor, RolloutState
 from ccil_jax.agents import behavior_cloning, contracts
-from ccil_jax.agents.base import Agent, EpisodeEstimates, episode_metrics, estimate_episodes, running_mean
+from ccil_jax.agents.base import (
+    Agent,
+    EpisodeEstimates,
+    episode_metrics,
+    estimate_episodes,
+    polynomial_decay_mean,
+    running_mean,
+)
 from ccil_jax.config import Config
 from ccil_jax.learning import constraints, policy_step, regression, reward_models
 from ccil_jax.learning.constraints import Constraint, EpisodeCosts
@@ -36,7 +43,7 @@ REWARD, COST = 0, 1  # order along every axis of length 2: critics, signals, dir
 class AgentState:
     """Everything one seed needs to continue exactly."""
 
-    actor: Actor
+    actor: Actor  # what is judged: the newest policy, or an average of all so far
     critics: Critic  # [2]-leading: reward, cost
     reward_model: PyTree
     constraint: PyTree
@@ -45,6 +52,14 @@ class AgentState:
     cost_rate: jax.Array  # [] cost so far per environment step so far
     iteration: jax.Array  # [] int32
     key: jax.Array
+    newest_params: PyTree = None  # of the newest policy where `actor` is an average
+
+    @property
+    def learner(self) -> Actor:
+        """The newest policy, which collects the next batch and is improved by it."""
+        if self.newest_params is None:
+            return self.actor
+        return dataclasses.replace(self.actor, policy_params=self.newest_params)
 
 
 @struct.dataclass(kw_only=True)
@@ -140,6 +155,8 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
         cost_rate=zero,
         iteration=jnp.zeros((), jnp.int32),
         key=key,
+        # Buffers of its own: those of the average are donated too.
+        newest_params=jax.tree.map(jnp.copy, actor.policy_params) if config.policy_average != "none" else None,
     )
 
 
@@ -163,13 +180,14 @@ def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
         **episode_metrics(state.estimates, cost_rate),
         **({"multiplier": parts.constraint.multiplier(constraint_state)} if parts.config.has_multiplier else {}),
         "entropy": distributions.entropy(
-            parts.policy.apply(state.actor.policy_params, jnp.zeros((1, parts.env.obs_dim)))
+            parts.policy.apply(state.learner.policy_params, jnp.zeros((1, parts.env.obs_dim)))
         ),
     }
     metrics |= {name: jnp.mean(value) for name, value in generator_metrics.items()}
     metrics["episodes_finished"] = jnp.sum(generator_metrics["episodes_finished"])
     new = dataclasses.replace(
         state,
+        actor=judged(parts, state, iteration),
         reward_model=reward_state,
         constraint=constraint_state,
         cost_rate=cost_rate,
@@ -177,6 +195,24 @@ def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
         key=key,
     )
     return new, contracts.join_metrics(metrics, reward_model=reward_metrics, constraint=constraint_metrics)
+
+
+def judged(parts: Parts, state: AgentState, iteration: jax.Array) -> Actor:
+    """The policy to evaluate after an iteration: the newest, or the average of all so far with the newest in it."""
+    if state.newest_params is None:
+        return state.actor
+    power = parts.config.policy_average_power
+    mean = functools.partial(polynomial_decay_mean, count=iteration, power=power)
+    params = jax.tree.map(mean, state.actor.policy_params, state.newest_params)
+    return dataclasses.replace(state.actor, policy_params=params)
+
+
+def with_learner(state: AgentState, learner: Actor) -> AgentState:
+    """`state` with another newest policy. The average keeps its parameters, and has the statistics of the newest."""
+    if state.newest_params is None:
+        return dataclasses.replace(state, actor=learner)
+    actor = dataclasses.replace(state.actor, obs_statistics=learner.obs_statistics)
+    return dataclasses.replace(state, actor=actor, newest_params=learner.policy_params)
 
 
 def generator_steps(parts: Parts, state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
@@ -198,10 +234,10 @@ def generator_steps(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Ag
 
 def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[AgentState, LastBatch, Metrics]:
     """One batch and what is learnt from it: policy and critics (Algorithm 1 lines 4 to 12)."""
-    config, policy, constraint = parts.config, parts.policy, parts.constraint
+    config, policy, constraint, learner = parts.config, parts.policy, parts.constraint, state.learner
     rollout_key, split_key, critic_key, expert_key = jax.random.split(key, 4)
     rollout_state, transition = rollout.rollout(
-        parts.env, policy.apply, state.actor, state.rollout, config.num_steps, rollout_key
+        parts.env, policy.apply, learner, state.rollout, config.num_steps, rollout_key
     )
     estimates, finished = estimate_episodes(state.estimates, transition)
     cost_gap = estimates.episode_cost - parts.limit
@@ -215,7 +251,7 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
         config,
         policy.apply,
         constraint,
-        state.actor.policy_params,
+        learner.policy_params,
         training,
         multiplier,
         step_gap,
@@ -227,8 +263,8 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
         params, taken, step_metrics = policy_step.unless(warming_up, params, taken, step_metrics)
     critics, critic_losses = fit_critics(parts, state.critics, training, critic_key)
 
-    assert state.actor.obs_statistics is not None
-    statistics = state.actor.obs_statistics
+    assert learner.obs_statistics is not None
+    statistics = learner.obs_statistics
     if parts.clone is None:  # other statistics would make another policy of the clone's parameters
         statistics = running_statistics.update(statistics, transition.obs)
     metrics = step_metrics | assess_metrics
@@ -239,8 +275,7 @@ def generator_step(parts: Parts, state: AgentState, key: jax.Array) -> tuple[Age
         "cost_critic_loss": critic_losses[COST],
     }
     new = dataclasses.replace(
-        state,
-        actor=Actor(policy_params=params, obs_statistics=statistics),
+        with_learner(state, Actor(policy_params=params, obs_statistics=statistics)),
         critics=critics,
         rollout=rollout_state,
         estimates=estimates,

@@ -56,7 +56,7 @@ def pieces_of(parts: Parts) -> Pieces:
         return jax.lax.scan(step, state.rollout.env_state, actions)
 
     def act(state: AgentState, key: jax.Array) -> Any:
-        return rollout.rollout(env, policy.apply, state.actor, state.rollout, config.num_steps, key)
+        return rollout.rollout(env, policy.apply, state.learner, state.rollout, config.num_steps, key)
 
     def score(state: AgentState, transition: Transition) -> Batch:
         samples, _ = on_policy.assess(parts, state, transition)
@@ -66,7 +66,7 @@ def pieces_of(parts: Parts) -> Pieces:
         return policy_step.split(samples, config.num_held_out, policy_step.random_order(config, key))
 
     def improve(state: AgentState, training: Batch, held_out: Batch) -> Any:
-        params, steps = state.actor.policy_params, on_policy.expert_steps(parts, state, jax.random.key(0))
+        params, steps = state.learner.policy_params, on_policy.expert_steps(parts, state, jax.random.key(0))
         return policy_step.improve(
             config, policy.apply, constraint, params, training, multiplier, zero, held_out, steps
         )
