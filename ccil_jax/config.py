@@ -7,6 +7,7 @@ sweeping it needs no compilation, and it may differ between vmapped runs).
 import dataclasses
 import math
 import numbers
+import types
 from collections.abc import Iterable, Mapping
 from typing import Any, Unpack
 
@@ -311,8 +312,11 @@ class Config:
     temperature: float | None = _traced(
         None, "weight of the entropy in the soft values; none takes the task's published value", IQ_LEARN
     )
-    cloning_weight: float = _traced(
-        0.0, "weight of the demonstrations' mean log likelihood in the policy's objective, after the cloning", CLONED
+    cloning_weight: float | None = _traced(
+        0.0,
+        "weight of the demonstrations' mean log likelihood in the policy's objective, after the cloning; none takes "
+        "their number of steps divided by batch_size, so that a demonstrated step counts as much as one of the batch",
+        CLONED,
     )
     cost_limit: float | None = _traced(
         None,
@@ -408,6 +412,7 @@ def field_names(*, traced: bool) -> tuple[str, ...]:
 
 _USES: Mapping[str, Use] = {f.name: f.metadata["use"] for f in dataclasses.fields(Config)}
 _DEFAULTS: Mapping[str, Any] = {f.name: f.default for f in dataclasses.fields(Config)}
+_OPTIONAL = frozenset(f.name for f in dataclasses.fields(Config) if isinstance(f.type, types.UnionType))
 
 
 def unused(config: Config) -> tuple[str, ...]:
@@ -479,7 +484,11 @@ def check_types(config: Config) -> None:
         elif isinstance(default, str):
             sound, wanted = isinstance(value, str), "a name"
         else:
-            sound, wanted = _is_number(value) or (value is None and default is None), "a number"
+            optional = name in _OPTIONAL
+            sound, wanted = (
+                _is_number(value) or (value is None and optional),
+                "a number or None" if optional else "a number",
+            )
         if not sound:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
 

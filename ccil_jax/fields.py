@@ -74,5 +74,5 @@ class Fields(TypedDict, total=False):
     target_update_rate: float
     chi2_coefficient: float
     temperature: float | None
-    cloning_weight: float
+    cloning_weight: float | None
     cost_limit: float | None

@@ -31,7 +31,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "action_likelihood": "censored",
         "cloning_updates": 20_000,
         "warmup_iterations": 5,
-        "cloning_weight": 3.0,
+        "cloning_weight": None,
         "standardize_cost_advantage": True,
         "gate": "episode",
         "initial_multiplier": 0.0,

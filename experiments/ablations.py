@@ -53,8 +53,11 @@ QUESTIONS: Mapping[str, Question] = {
     "action_likelihood": _one_field(
         "Is an action at a bound taken for all draws beyond it?", "action_likelihood", ("censored", "gaussian")
     ),
-    "cloning_weight": _after_cloning(
-        "How much do the demonstrations weigh in the policy's objective?", "cloning_weight", (3.0, 0.0, 0.3, 1.0, 10.0)
+    "cloning_weight": Question(
+        "How much do the demonstrations weigh in the policy's objective?",
+        "malm",
+        {"by their number": {"cloning_updates": 20_000, "cloning_weight": None}}
+        | {str(value): {"cloning_updates": 20_000, "cloning_weight": value} for value in (0.0, 0.3, 3.0, 10.0)},
     ),
     "warmup_iterations": _after_cloning(
         "Do critics and discriminator need a start before the policy moves?", "warmup_iterations", (5, 0)

@@ -296,6 +296,17 @@ def test_what_a_clone_would_be_needed_for_is_refused_without_one(fields: dict[st
         validate(Config(**fields))
 
 
+def test_without_a_weight_a_demonstrated_step_counts_as_much_as_one_of_the_batch() -> None:
+    demonstrations = walk_demonstrations()
+    config = walk_config(method="malm", cloning_updates=100, cloning_weight=None)
+    found = build.resolve(config, Walk(), demonstrations)
+    assert found.cloning_weight == demonstrations.num_steps / config.batch_size
+    assert build.resolve(found, Walk(), demonstrations) == found
+    one = demonstrations.take_episodes(1)
+    assert build.resolve(config, Walk(), one).cloning_weight == one.num_steps / config.batch_size < found.cloning_weight
+    assert build.resolve(config.replace(cloning_weight=0.2), Walk(), demonstrations).cloning_weight == 0.2
+
+
 @pytest.mark.parametrize("method", ["trpo", "expert"])
 def test_a_preset_with_a_clone_suits_methods_without_demonstrations(method: str) -> None:
     limit = {"cost_limit": 1.0} if method == "expert" else {}

@@ -32,7 +32,9 @@ class Kind(NamedTuple):
 
 
 AGENTS: Mapping[str, Kind] = {  # by the names in `METHODS`
-    "on_policy": Kind(on_policy.make, ("constraint", "reward_model", "policy", "critic", "optimizer")),
+    "on_policy": Kind(
+        on_policy.make, ("constraint", "reward_model", "policy", "critic", "optimizer"), on_policy.resolve
+    ),
     "behavior_cloning": Kind(behavior_cloning.make, ("policy", "optimizer")),
     "iq_learn": Kind(iq_learn.make, ("policy", "critic", "optimizer"), iq_learn.resolve),
 }

@@ -25,6 +25,7 @@ from ccil_jax.agents.base import (
     running_mean,
 )
 from ccil_jax.config import Config
+from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.learning import constraints, policy_step, regression, reward_models
 from ccil_jax.learning.constraints import Constraint, EpisodeCosts
 from ccil_jax.learning.optimizers import Optimizer, adam
@@ -135,6 +136,13 @@ def make(config: Config, env: Environment, expert: ExpertData | None, **own: obj
     """
     parts = make_parts(config, env, expert, **own)  # type: ignore[arg-type]  # checked by `build.make_agent`
     return Agent(init=functools.partial(init, parts), step=functools.partial(step, parts))
+
+
+def resolve(config: Config, env: Environment, demonstrations: Demonstrations) -> Config:
+    """The configuration with the weight of the demonstrations' likelihood set."""
+    if config.cloning_weight is None:
+        config = config.replace(cloning_weight=demonstrations.num_steps / config.batch_size)
+    return config
 
 
 def init(parts: Parts, key: jax.Array) -> AgentState:

@@ -140,7 +140,10 @@ def _weights(
 ) -> jax.Array:
     """Of the objectives in the step: the constraint's for reward and cost, and that of the demonstrations, if any."""
     weights = constraint.combine(multiplier, step_gap, gram[:2, :2])
-    return weights if len(gram) == 2 else jnp.append(weights, config.cloning_weight)
+    if len(gram) == 2:
+        return weights
+    assert config.cloning_weight is not None, "resolved beforehand"
+    return jnp.append(weights, config.cloning_weight)
 
 
 def outer_problem(
@@ -165,6 +168,7 @@ def outer_problem(
 
     def likelihood(multiplier: jax.Array) -> jax.Array:
         assert expert is not None
+        assert config.cloning_weight is not None, "resolved beforehand"
         cloned = policy_apply(unravel(stepped(multiplier)), expert.obs)
         return config.cloning_weight * jnp.mean(distributions.log_prob(cloned, expert.action))
 

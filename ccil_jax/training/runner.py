@@ -313,7 +313,8 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     Raises:
         CheckpointError: there is no intact checkpoint, or it is another training's.
     """
-    config = config.replace(cost_limit=config.cost_limit or 0.0, temperature=config.temperature or 0.0)
+    absent = {name: 0.0 for name in ("cost_limit", "temperature", "cloning_weight") if getattr(config, name) is None}
+    config = config.replace(**absent)
     # Traced fields do not matter for acting, and the cost limit may not be known without the demonstrations. Nor does
     # it matter how an earlier version counted the length of a training.
     identity, free = Identity(configs=(config,), num_seeds=num_seeds), frozenset({*field_names(traced=True), *GONE})
