@@ -83,6 +83,9 @@ QUESTIONS: Mapping[str, Question] = {
             "cost, 0.0005": {"multiplier_update": "sgd", "gap_unit": "cost", "multiplier_learning_rate": 0.0005},
         },
     ),
+    "discriminator_learning_rate": _one_field(
+        "How much may the discriminator learn?", "discriminator_learning_rate", (3e-4, 3e-5, 0.0)
+    ),
     "policy_average": _one_field(
         "Is what is judged the average of the policies?", "policy_average", ("polynomial_decay", "none")
     ),

@@ -54,6 +54,7 @@ def test_traced_answers_share_a_program_and_baselines_have_their_own(tmp_path: P
         *(f"malm,multiplier_learning_rate={rate}" for rate in (0.01, 0.2)),
         *(f"malm,meta_learning_rate={rate}" for rate in (0.01, 0.2)),
         *(f"malm,initial_multiplier={start}" for start in (1.0, 10.0)),
+        *(f"malm,discriminator_learning_rate={rate}" for rate in (3e-05, 0.0)),
         "malm,cost_gae_lambda=0.9",
     } in names
     assert sum(map(len, names)) == len(different)
