@@ -54,13 +54,22 @@ class AgentState:
     cost_rate: jax.Array  # [] cost so far per environment step so far
     iteration: jax.Array  # [] int32
     key: jax.Array
-    newest_params: PyTree = None  # of the newest policy where `actor` is an average
 
     @property
     def learner(self) -> Actor:
         """The newest policy, which collects the next batch and is improved by it."""
-        if self.newest_params is None:
-            return self.actor
+        return self.actor
+
+
+@struct.dataclass(kw_only=True)
+class AveragingState(AgentState):
+    """Where `actor` is an average of the policies. A class of its own: checkpoints of others have no such part."""
+
+    newest_params: PyTree  # of the newest policy
+
+    @property
+    def learner(self) -> Actor:
+        """The newest policy; its observation statistics are the average's too."""
         return dataclasses.replace(self.actor, policy_params=self.newest_params)
 
 
@@ -154,7 +163,7 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
     init_critic = functools.partial(regression.init, optimizer=parts.optimizer)
     zero = jnp.zeros(())
     actor = first_actor(parts, policy_key)
-    return AgentState(
+    state = AgentState(
         actor=actor,
         critics=jax.vmap(init_critic, in_axes=(0, None))(critic_params, config.critic_learning_rate),
         reward_model=parts.reward_model.begin(parts.reward_model.init(reward_key), actor),
@@ -164,9 +173,12 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
         cost_rate=zero,
         iteration=jnp.zeros((), jnp.int32),
         key=key,
-        # Buffers of its own: those of the average are donated too.
-        newest_params=jax.tree.map(jnp.copy, actor.policy_params) if config.policy_average != "none" else None,
     )
+    if config.policy_average == "none":
+        return state
+    fields = {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+    # Buffers of its own: those of the average are donated too.
+    return AveragingState(**fields, newest_params=jax.tree.map(jnp.copy, actor.policy_params))
 
 
 def first_actor(parts: Parts, key: jax.Array) -> Actor:
@@ -208,7 +220,7 @@ def step(parts: Parts, state: AgentState) -> tuple[AgentState, Metrics]:
 
 def judged(parts: Parts, state: AgentState, iteration: jax.Array) -> Actor:
     """The policy to evaluate after an iteration: the newest, or the average of all so far with the newest in it."""
-    if state.newest_params is None:
+    if not isinstance(state, AveragingState):
         return state.actor
     power = parts.config.policy_average_power
     mean = functools.partial(polynomial_decay_mean, count=iteration, power=power)
@@ -218,7 +230,7 @@ def judged(parts: Parts, state: AgentState, iteration: jax.Array) -> Actor:
 
 def with_learner(state: AgentState, learner: Actor) -> AgentState:
     """`state` with another newest policy. The average keeps its parameters, and has the statistics of the newest."""
-    if state.newest_params is None:
+    if not isinstance(state, AveragingState):
         return dataclasses.replace(state, actor=learner)
     actor = dataclasses.replace(state.actor, obs_statistics=learner.obs_statistics)
     return dataclasses.replace(state, actor=actor, newest_params=learner.policy_params)
