@@ -315,8 +315,7 @@ class Config:
     cloning_weight: float | None = _traced(
         0.0,
         "weight of the demonstrations' mean log likelihood in the policy's objective, after the cloning; none takes "
-        "their number of steps, mirror images included, divided by batch_size, so that a demonstrated step counts as "
-        "much as one of the batch",
+        "their number of steps divided by batch_size, so that a demonstrated step counts as much as one of the batch",
         CLONED,
     )
     cost_limit: float | None = _traced(

@@ -208,16 +208,3 @@ def test_the_limit_stays_that_of_the_demonstrations() -> None:
     env, demonstrations = envs.make("PointGoal1"), random_demonstrations("PointGoal1")
     config = Config(method="ccil", mirrored_demonstrations="symmetric_tasks")
     assert build.resolve(config, env, demonstrations).cost_limit == 10.0
-
-
-def test_images_count_as_demonstrated_steps() -> None:
-    env, demonstrations = envs.make("PointGoal1"), random_demonstrations("PointGoal1")
-    weights = [
-        build.resolve(
-            Config(method="gail", cloning_updates=100, cloning_weight=None, mirrored_demonstrations=choice),
-            env,
-            demonstrations,
-        ).cloning_weight
-        for choice in ("none", "symmetric_tasks")
-    ]
-    assert weights == [20 / Config().batch_size, 40 / Config().batch_size]

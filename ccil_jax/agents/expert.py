@@ -12,19 +12,10 @@ from ccil_jax.types import ExpertData, ExpertTransitions
 from envs.base import Environment, Mirror, mirror_of
 
 
-def symmetry_of(config: Config, env: Environment) -> Mirror | None:
-    """The mirror symmetry by which demonstrations have images, where `config` and the task say so."""
-    return mirror_of(env) if config.mirrored_demonstrations == "symmetric_tasks" else None
-
-
-def num_demonstrated(config: Config, env: Environment, demonstrations: Demonstrations) -> int:
-    """How many steps the methods learn from, mirror images included."""
-    return demonstrations.num_steps * (1 if symmetry_of(config, env) is None else 2)
-
-
 def expert_of(config: Config, env: Environment, demonstrations: Demonstrations | None) -> ExpertData | None:
     """What the methods learn from: the demonstrations, with their mirror images where `config` and the task say so."""
-    return expert_data(demonstrations, symmetry_of(config, env))
+    symmetric = config.mirrored_demonstrations == "symmetric_tasks"
+    return expert_data(demonstrations, mirror_of(env) if symmetric else None)
 
 
 def expert_data(demonstrations: Demonstrations | None, mirror: Mirror | None = None) -> ExpertData | None:

@@ -24,7 +24,6 @@ from ccil_jax.agents.base import (
     polynomial_decay_mean,
     running_mean,
 )
-from ccil_jax.agents.expert import num_demonstrated
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.learning import constraints, policy_step, regression, reward_models
@@ -151,7 +150,7 @@ def make(config: Config, env: Environment, expert: ExpertData | None, **own: obj
 def resolve(config: Config, env: Environment, demonstrations: Demonstrations) -> Config:
     """The configuration with the weight of the demonstrations' likelihood set."""
     if config.cloning_weight is None:
-        config = config.replace(cloning_weight=num_demonstrated(config, env, demonstrations) / config.batch_size)
+        config = config.replace(cloning_weight=demonstrations.num_steps / config.batch_size)
     return config
 
 
