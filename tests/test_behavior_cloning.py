@@ -91,7 +91,7 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
     )
     expert = expert_data(demonstrations)
     agent = behavior_cloning.make(config, env, expert)
-    state, step, losses, seen = agent.init(jax.random.key(1)), jax.jit(agent.step), [], []
+    state, step, losses, seen = jax.jit(agent.init)(jax.random.key(1)), jax.jit(agent.step), [], []
     for _ in range(60):
         state, metrics = step(state)
         losses.append(float(metrics["held_out_loss"]))

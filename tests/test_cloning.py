@@ -147,7 +147,7 @@ def test_the_observation_statistics_stay_those_of_the_demonstrations() -> None:
 def test_steps_of_the_demonstrations_are_drawn_anew_and_normalised_as_the_policy_sees_them() -> None:
     parts = parts_of("malm", cloning_updates=100, held_out_fraction=0.25)
     assert parts.expert is not None
-    state = on_policy.init(parts, jax.random.key(0))
+    state = agent_of(parts).init(jax.random.key(0))
     drawn = [on_policy.expert_steps(parts, state, jax.random.key(seed)) for seed in (0, 1)]
     all_obs = np.asarray(running_statistics.normalize(state.actor.obs_statistics, parts.expert.obs))
     chosen = []

@@ -117,7 +117,7 @@ def test_the_clone_of_an_own_policy_is_judged_by_that_policy() -> None:
     config = walk_config(method="gail", **COHERENT)
     expert = expert_data(walk_demonstrations())
     parts = on_policy.make_parts(config, Walk(), expert, policy=ccil_jax.Policy(init, apply))
-    state = on_policy.init(parts, jax.random.key(0))
+    state = agent_of(parts).init(jax.random.key(0))
     steps = steps_of(Walk())
     clone = state.reward_model
     mean = running_statistics.normalize(clone.obs_statistics, steps.obs) @ clone.policy_params["weights"]
@@ -178,7 +178,7 @@ def test_the_outer_step_replays_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(policy_step, "outer_problem", watched)
     parts = parts_of(Walk(), "malm", outer_advantage="re-evaluated", held_out_fraction=0.5)
-    state = on_policy.init(parts, jax.random.key(5))
+    state = agent_of(parts).init(jax.random.key(5))
     state, last, _ = on_policy.generator_steps(parts, state, jax.random.key(6))
     _, metrics = on_policy.update_constraint(parts, state, state.reward_model, last)  # not jitted: numbers are seen
     assert metrics["meta_gradient"] != 0

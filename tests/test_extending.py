@@ -87,7 +87,7 @@ def test_a_rule_from_outside_is_that_of_the_package_where_both_say_the_same() ->
 
     def trained(constraint: ccil_jax.Constraint | None) -> Any:
         agent = ccil_jax.make_agent(config, Walk(), walk_demonstrations(), constraint=constraint)
-        step, state = jax.jit(agent.step), agent.init(jax.random.key(3))
+        step, state = jax.jit(agent.step), jax.jit(agent.init)(jax.random.key(3))
         for _ in range(4):
             state, metrics = step(state)
         return state.actor, metrics
@@ -123,7 +123,7 @@ def test_optimizer_and_critic_of_a_users_own_are_used() -> None:
         config, Walk(), walk_demonstrations(), critic=critic, optimizer=lambda learning_rate: optax.sgd(0.0)
     )
     with quick_compilation():
-        state, _ = jax.jit(agent.step)(agent.init(jax.random.key(0)))
+        state, _ = jax.jit(agent.step)(jax.jit(agent.init)(jax.random.key(0)))
     np.testing.assert_array_equal(state.critics.params, np.ones((2, 2)))
 
 

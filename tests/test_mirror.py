@@ -142,7 +142,7 @@ def test_what_is_no_mirror_is_refused(changes: dict[str, list[int]], message: st
     [(mirror_with(), r"Swimmer: mirror.obs_index must have shape \(8,\)"), ("left", "Swimmer: mirror is of type str")],
 )
 def test_a_mirror_that_does_not_fit_the_task_is_refused_before_anything_is_trained(mirror: Any, message: str) -> None:
-    class Mirrored(type(envs.make("Swimmer"))):  # type: ignore[misc]
+    class Mirrored(type(envs.make("Swimmer"))):  # type: ignore[misc]  # its base is known only at run time
         pass
 
     env = envs.make("Swimmer")
