@@ -313,10 +313,9 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
     Raises:
         CheckpointError: there is no intact checkpoint, or it is another training's.
     """
-    absent = {name: 0.0 for name in ("cost_limit", "temperature", "cloning_weight") if getattr(config, name) is None}
-    config = config.replace(**absent)
-    # Traced fields do not matter for acting, and the cost limit may not be known without the demonstrations. Nor does
-    # it matter how an earlier version counted the length of a training.
+    # Traced fields do not matter for acting, and those that are resolved from the demonstrations may not be known
+    # without them. Nor does it matter how an earlier version counted the length of a training.
+    config = config.replace(**{name: 0.0 for name in field_names(traced=True) if getattr(config, name) is None})
     identity, free = Identity(configs=(config,), num_seeds=num_seeds), frozenset({*field_names(traced=True), *GONE})
     with Checkpointer(checkpoint_dir, identity, free=free, readonly=True) as checkpoints:
         step = checkpoints.latest_step()
