@@ -1,22 +1,25 @@
 """Evaluates every seed of a trained run: return and cost over fresh episodes, in our simulator or the original one.
 
+With --policy, the policies of a file are evaluated in place of a run's: one that --export wrote, or a shipped expert.
 The result file keeps all evaluations: the newest of each simulator under the simulator's name, older ones under
 `earlier`. With --record, the policy of one seed is also recorded as demonstrations, as `expert` does it. With --export,
-the policies of all seeds are also written to files that other programs can use.
+the policies of all seeds, or that of --seed-index, are also written to files that other programs can use.
 """
 
 import argparse
+import dataclasses
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import save_demonstrations
+from envs import registry
 from envs.registry import TaskInfo
 from experiments.cli import command_line, xla
 from experiments.cli.command_line import Parser, UsageError
-from experiments.policies import evaluating
+from experiments.policies import evaluating, policy_file
 from experiments.policies.evaluating import Loaded, Settings
 from experiments.policies.numpy_policy import is_known
 from experiments.runs import evaluations, recording, run_folder, summary
@@ -28,7 +31,14 @@ _NUM_TRAJECTORIES = 10  # to record, unless said otherwise
 def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("evaluate", __doc__ or "")
-    parser.add_argument("run", type=Path, metavar="RUN_DIR", help="folder that `train` or `expert` wrote")
+    parser.add_argument("run", nargs="?", type=Path, metavar="RUN_DIR", help="folder that `train` or `expert` wrote")
+    parser.add_argument(
+        "--policy",
+        type=Path,
+        metavar="FILE.npz",
+        help="evaluate the policies of this file, which --export wrote, or that of a shipped expert by the name of its "
+        "task; in place of RUN_DIR",
+    )
     parser.add_argument(
         "--episodes", default=50, type=command_line.positive, metavar="N", help="episodes per seed (default: 50)"
     )
@@ -49,14 +59,20 @@ def make_parser() -> Parser:
         action="store_true",
         help="all seeds play the same starts, layouts and noise, for paired comparisons (default: each seed its own)",
     )
+    _add_files(parser)
+    return parser
+
+
+def _add_files(parser: Parser) -> None:
+    """Options of what is written."""
     parser.add_argument(
         "--export",
         nargs="+",
         default=[],
         type=Path,
         metavar="FILE",
-        help="also write the policies of all seeds: as NumPy arrays, together with the results of these episodes "
-        "(.npz), or as a StableHLO program (.stablehlo)",
+        help="also write the policies of all seeds, or that of --seed-index: as NumPy arrays, together with the "
+        "results of these episodes (.npz), or as a StableHLO program (.stablehlo)",
     )
     parser.add_argument(
         "--record",
@@ -68,8 +84,8 @@ def make_parser() -> Parser:
         "--seed-index",
         type=command_line.natural,
         metavar="N",
-        help="the seed to record (default: as `expert` chooses, the one with the highest return among those within the "
-        "cost limit)",
+        help="the seed to record and to export (default: --export writes all; --record chooses as `expert` does, the "
+        "seed with the highest return among those within the cost limit)",
     )
     parser.add_argument(
         "--num-trajectories",
@@ -82,13 +98,52 @@ def make_parser() -> Parser:
         "--out",
         type=Path,
         metavar="FILE",
-        help="result file, which keeps earlier results (default: RUN_DIR/evaluation.json)",
+        help="result file, which keeps earlier results (default: RUN_DIR/evaluation.json; none for --policy)",
     )
-    return parser
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Checks everything, plays the episodes, writes the results and prints them."""
+    if (arguments.run is None) == (arguments.policy is None):
+        raise UsageError("RUN_DIR: give the folder of a run, or --policy FILE.npz; one of the two")
+    source = _find_run(arguments) if arguments.run else _find_policies(arguments)
+    path = arguments.out or (arguments.run / "evaluation.json" if arguments.run else None)
+    if path:
+        evaluations.read(path)
+    if arguments.simulator == "original":
+        check_original(source.task)
+    check_policy(arguments, source.config)
+    files = check_files(arguments, path)
+    check_recording(arguments, source)
+    for option, file in files:
+        command_line.check_writable(file.parent, option)
+    xla.spread_seeds(len(source.seeds))
+    loaded, settings = source.load(), _settings(arguments)
+    episodes = evaluating.play(loaded, settings)
+    content, reference = evaluating.judge(loaded, settings, episodes)
+    _export(arguments, loaded, episodes, settings)
+    if arguments.record:
+        _record(arguments, source, loaded, content)
+    title = f"{source.title}, {arguments.episodes} episodes per seed, {arguments.simulator} simulator"
+    summary.print_table(title, content["per_seed"], content["aggregate"], reference)
+    if path:
+        evaluations.add(path, content)
+        print(f"written to {path}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Source:
+    """Where policies come from, before JAX is imported: a run or a file."""
+
+    title: str
+    task: TaskInfo
+    config: Config
+    seeds: Sequence[int]  # of the policies, as the user calls them
+    load: Callable[[], Loaded]
+    run: Run | None  # None for a file
+
+
+def _find_run(arguments: argparse.Namespace) -> Source:
     if not arguments.run.is_dir():
         raise UsageError(f"RUN_DIR {arguments.run}: no such folder; give a folder that `train` wrote")
     stored = run_folder.read_run(arguments.run)
@@ -96,29 +151,32 @@ def run(arguments: argparse.Namespace) -> None:
     checkpoints = arguments.run / "checkpoints"
     if not checkpoints.is_dir() or not any(checkpoints.iterdir()):
         raise UsageError(f"RUN_DIR {arguments.run}: holds no checkpoint; train first, or resume with `train --resume`")
-    path = arguments.out or arguments.run / "evaluation.json"
-    evaluations.read(path)
-    if arguments.simulator == "original":
-        check_original(task)
-    check_policy(arguments, stored.config)
-    files = check_files(arguments, path)
-    described = describe_recording(arguments, stored)
-    for option, file in files:
-        command_line.check_writable(file.parent, option)
-    xla.spread_seeds(stored.facts["num_seeds"])
-    loaded, settings = evaluating.load(stored), _settings(arguments)
-    episodes = evaluating.play(loaded, settings)
-    _export(arguments.export, loaded, episodes, evaluating.facts_of(loaded, settings))
-    if described:
-        _record(arguments, loaded, described)
-    content, reference = evaluating.judge(loaded, settings, episodes)
-    title = (
-        f"{stored.config.method} on {task.name}, {arguments.episodes} episodes per seed, "
-        f"{arguments.simulator} simulator"
+    return Source(
+        title=f"{stored.config.method} on {task.name}",
+        task=task,
+        config=stored.config,
+        seeds=range(stored.facts["num_seeds"]),
+        load=lambda: evaluating.load(stored),
+        run=stored,
     )
-    summary.print_table(title, content["per_seed"], content["aggregate"], reference)
-    evaluations.add(path, content)
-    print(f"written to {path}")
+
+
+def _find_policies(arguments: argparse.Namespace) -> Source:
+    file = policy_file.read(policy_file.find(arguments.policy))
+    training = file.training
+    if training["task"] not in registry.TASKS:  # a module that a file names is not imported: it would run its code
+        raise UsageError(
+            f"--policy {arguments.policy}: of task {training['task']}, which is none of this package; give the folder "
+            "of its run"
+        )
+    return Source(
+        title=f"{training['method']} on {training['task']}",
+        task=registry.TASKS[training["task"]],
+        config=file.config,
+        seeds=training["seed_indices"],
+        load=lambda: evaluating.load_file(file, registry.TASKS[training["task"]]),
+        run=None,
+    )
 
 
 def check_original(task: TaskInfo) -> None:
@@ -144,8 +202,8 @@ def check_policy(arguments: argparse.Namespace, config: Config) -> None:
             raise UsageError(f"--export {file}: {reason}; give a file named *.stablehlo")
 
 
-def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Path]]:
-    """The files that are to be written, each with its option: the result file `path`, then --export and --record.
+def check_files(arguments: argparse.Namespace, path: Path | None) -> list[tuple[str, Path]]:
+    """The files that are to be written, each with its option: the result file `path`, if any, then --export, --record.
 
     Raises:
         UsageError: a file's name has an unknown ending, or the file would replace another.
@@ -159,34 +217,57 @@ def check_files(arguments: argparse.Namespace, path: Path) -> list[tuple[str, Pa
     written += [("--record", arguments.record)] if arguments.record else []
     if arguments.overwrite and not written:
         raise UsageError("--overwrite: for files of --export and --record, and neither is given; leave it out")
-    taken = {path.resolve()}
+    results = [("--out", path)] if path else []
+    taken = {path.resolve() for _, path in results}
     for option, file in written:
         if file.resolve() in taken:
             raise UsageError(f"{option} {file}: two results would go into this file; give each a name of its own")
         taken.add(file.resolve())
         command_line.check_new_file(file, option, overwrite=arguments.overwrite)
-    return [("--out", path), *written]
+    return [*results, *written]
 
 
-def describe_recording(arguments: argparse.Namespace, stored: Run) -> dict[str, Any] | None:
-    """The metadata of the demonstrations that are to be recorded, such as `seed_index`; None without --record.
-
-    Raises:
-        UsageError: there is nothing that could be recorded, or an option does not go with --record.
-    """
+def check_recording(arguments: argparse.Namespace, source: Source) -> None:
+    """Raises `UsageError` where there is nothing to record, or an option does not go with --record."""
     if arguments.record is None:
-        for option, value in (("seed-index", arguments.seed_index), ("num-trajectories", arguments.num_trajectories)):
-            if value is not None:
-                raise UsageError(f"--{option} {value}: says what to record; add --record FILE.npz")
-        return None
-    if arguments.deterministic:
+        if arguments.num_trajectories is not None:
+            raise UsageError(
+                f"--num-trajectories {arguments.num_trajectories}: says what to record; add --record FILE.npz"
+            )
+        if arguments.seed_index is not None and not arguments.export:
+            raise UsageError(
+                f"--seed-index {arguments.seed_index}: says what to record or export; add --record or --export FILE.npz"
+            )
+    if arguments.record and arguments.deterministic:
         raise UsageError("--deterministic: demonstrations are recorded from sampled actions; leave one of the two out")
-    if arguments.simulator == "original":
+    if arguments.record and arguments.simulator == "original":
         raise UsageError("--simulator original: demonstrations are recorded in ours; leave one of the two out")
-    finished = recording.read_summary(stored)
-    seed_index = recording.find_seed(stored, finished["per_seed"], arguments.seed_index)
-    command = "\n".join([stored.facts["command"], command_line.command()])
-    return recording.facts(stored, finished, seed_index, command)
+    if arguments.seed_index is not None and arguments.seed_index not in source.seeds:
+        known = ", ".join(map(str, source.seeds))
+        raise UsageError(f"--seed-index {arguments.seed_index}: there is no such seed; give one of {known}")
+    if arguments.record and source.run:
+        recording.find_seed(source.run, recording.read_summary(source.run)["per_seed"], arguments.seed_index)
+
+
+def describe_recording(
+    arguments: argparse.Namespace, source: Source, loaded: Loaded, content: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The metadata of the demonstrations that are to be recorded, such as `seed_index`.
+
+    A run was evaluated when it was trained, and its summary.json says how well its seeds do. The policies of a file are
+    described by `content`, the evaluation of this process.
+    """
+    if source.run:
+        scores = recording.read_summary(source.run)
+        num_episodes = scores.get("evaluation", {}).get("num_episodes")
+        chosen = recording.find_seed(source.run, scores["per_seed"], arguments.seed_index)
+    else:
+        rows = [{**row, "seed": seed} for row, seed in zip(content["per_seed"], source.seeds, strict=True)]
+        scores, num_episodes = {**content, "per_seed": rows}, arguments.episodes
+        chosen = source.seeds[0] if arguments.seed_index is None else arguments.seed_index
+    trained = {name: value for name, value in loaded.training.items() if name != "seed_indices"}
+    made_by = f"{loaded.command}\n{command_line.command()}"
+    return recording.facts(trained, scores, chosen, num_episodes, made_by)
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:
@@ -199,24 +280,31 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     )
 
 
-def _export(files: Sequence[Path], loaded: Loaded, episodes: Any, facts: dict[str, Any]) -> None:
+def _export(arguments: argparse.Namespace, loaded: Loaded, episodes: Any, settings: Settings) -> None:
     from experiments.policies import exporting  # imports JAX
 
-    for file in files:
+    if arguments.export and arguments.seed_index is not None:
+        index = loaded.training["seed_indices"].index(arguments.seed_index)
+        loaded, episodes = loaded.only(index), evaluating.only(episodes, index)
+    for file in arguments.export:
         if file.suffix == ".npz":
-            exporting.export_numpy(file, loaded.config, loaded.actor, loaded.env, episodes, facts)
+            exporting.export_numpy(
+                file, loaded.config, loaded.actor, loaded.env, episodes, evaluating.facts_of(loaded, settings)
+            )
         else:
             exporting.export_stablehlo(file, loaded.config, loaded.actor, loaded.env)
         print(f"policies {file}")
 
 
-def _record(arguments: argparse.Namespace, loaded: Loaded, described: Mapping[str, Any]) -> None:
+def _record(arguments: argparse.Namespace, source: Source, loaded: Loaded, content: Mapping[str, Any]) -> None:
+    described = describe_recording(arguments, source, loaded, content)
     demonstrations = recording.record(
         loaded.config,
         loaded.actor,
         loaded.env,
         num_trajectories=arguments.num_trajectories or _NUM_TRAJECTORIES,
         episode_seed=(arguments.seed + 1) % 2**32,  # other episodes than those that judge the policy
+        seed_index=loaded.training["seed_indices"].index(described["seed_index"]),
         facts=described,
     )
     save_demonstrations(arguments.record, demonstrations)

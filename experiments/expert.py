@@ -3,8 +3,9 @@
 The policy of one seed is recorded: among the seeds whose mean evaluation cost is at most the limit, the one with the
 highest mean return. If no seed keeps the limit, nothing is recorded and the exit status is 1. With --unconstrained
 there is no limit, and the seed with the highest mean return is recorded. The policy samples its actions, as it did in
-training. Hyperparameters start from the preset that the task names: `safety_gym_expert` for Safety Gym tasks, `expert`
-for all others.
+training. With --export, the policy itself is written too, for `evaluate --policy` and for programs without JAX.
+Hyperparameters start from the preset that the task names: `safety_gym_expert` for Safety Gym tasks, `expert` for all
+others.
 """
 
 import argparse
@@ -18,10 +19,12 @@ from ccil_jax.demonstrations.trajectories import save_demonstrations
 from envs.registry import TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
-from experiments.runs import run_folder
+from experiments.policies import evaluating
+from experiments.policies.evaluating import Loaded, Settings
+from experiments.runs import recording, run_folder
 from experiments.runs.execution import execute
-from experiments.runs.plans import RunPlan, make_setup
-from experiments.runs.recording import choose_seed, facts, print_demonstrations, record
+from experiments.runs.plans import RunPlan, Setup, make_setup
+from experiments.runs.recording import choose_seed
 from experiments.runs.resuming import resumed
 
 DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
@@ -43,7 +46,10 @@ def make_parser() -> Parser:
     parser = Parser("expert", __doc__ or "")
     options.add_run_options(parser, DEFAULTS)
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
+    parser.add_argument(
+        "--export", type=Path, metavar="FILE.npz", help="also write the policy that is recorded, as NumPy arrays"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace existing files of --out and --export")
     parser.add_argument(
         "--unconstrained", action="store_true", help="plain TRPO, which ignores the cost (no --cost-limit)"
     )
@@ -64,14 +70,18 @@ def make_parser() -> Parser:
 
 def make_plan(arguments: argparse.Namespace) -> RunPlan:
     """Turns the options into the plan of a run. Raises a `UserError` for wrong input."""
-    own = ("out", "overwrite", "unconstrained", "num_trajectories", "run_dir", "resume")
+    own = ("out", "export", "overwrite", "unconstrained", "num_trajectories", "run_dir", "resume")
     given = {k: v for k, v in vars(arguments).items() if k not in own}
     given["method"] = method = "trpo" if arguments.unconstrained else "expert"
     if arguments.unconstrained and given.get("cost_limit") is not None:
         raise UsageError("--cost-limit: --unconstrained has no limit; give one or the other")
-    if arguments.out.suffix != ".npz":
-        raise UsageError(f"--out {arguments.out}: a demonstrations file is named *.npz")
-    command_line.check_new_file(arguments.out, "--out", overwrite=arguments.overwrite)
+    written = {"--out": arguments.out, **({"--export": arguments.export} if arguments.export else {})}
+    for option, file in written.items():
+        if file.suffix != ".npz":
+            raise UsageError(f"{option} {file}: the file is named *.npz")
+        command_line.check_new_file(file, option, overwrite=arguments.overwrite)
+    if len({file.resolve() for file in written.values()}) < len(written):
+        raise UsageError(f"--export {arguments.export}: is the file of --out; give each a name of its own")
     saved = _resumed(arguments.run_dir, given) if arguments.resume else {}
     choices = {**DEFAULTS, "env": None, **saved, **given}
     task = options.find_task(choices["env"])
@@ -79,7 +89,8 @@ def make_plan(arguments: argparse.Namespace) -> RunPlan:
     preset = {**saved, **given}.get("preset", task.expert_preset)
     config = options.config_from({**given, **limit}, preset, saved)
     env_options = options.env_options(choices, task)
-    command_line.check_writable(arguments.out.parent, "--out")
+    for option, file in written.items():
+        command_line.check_writable(file.parent, option)
     folder = arguments.run_dir or command_line.default_folder(task.name, method, "--run-dir")
     command_line.check_output_folder(folder, resume=arguments.resume, option="--run-dir")
     return RunPlan(
@@ -136,18 +147,43 @@ def run(arguments: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return 1
-    trained = run_folder.read_run(plan.folder)
-    demonstrations = record(
-        outcome.result.config,
-        outcome.result.actor,
-        outcome.env,
+    trained, result = run_folder.read_run(plan.folder), outcome.result
+    loaded = evaluating.of_run(trained, outcome.env, result.config, result.actor, result.env_steps)
+    demonstrations = recording.record(
+        loaded.config,
+        loaded.actor,
+        loaded.env,
         num_trajectories=arguments.num_trajectories,
         episode_seed=(plan.setup.evaluation_seed + 1) % 2**32,
-        facts=facts(trained, outcome.summary, seed, trained.facts["command"]),
+        seed_index=seed,
+        facts=recording.facts(
+            recording.training(trained, result.env_steps),
+            outcome.summary,
+            seed,
+            plan.setup.eval_episodes,
+            loaded.command,
+        ),
     )
     save_demonstrations(arguments.out, demonstrations)
-    print_demonstrations(demonstrations, arguments.out)
+    recording.print_demonstrations(demonstrations, arguments.out)
+    if arguments.export:
+        _export(arguments.export, loaded.only(seed), evaluating.only(outcome.evaluation, seed), plan.setup)
     return 0
+
+
+def _export(file: Path, loaded: Loaded, episodes: Any, setup: Setup) -> None:
+    from experiments.policies import exporting  # imports JAX
+
+    settings = Settings(
+        simulator="ours",
+        num_episodes=setup.eval_episodes,
+        seed=setup.evaluation_seed,
+        deterministic=False,
+        shared_episodes=False,
+    )
+    facts = {**evaluating.facts_of(loaded, settings), "command": loaded.command}
+    exporting.export_numpy(file, loaded.config, loaded.actor, loaded.env, episodes, facts)
+    print(f"policy  {file}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

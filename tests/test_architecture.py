@@ -281,10 +281,9 @@ def test_editors_know_the_public_names_that_are_imported_lazily() -> None:
     assert seen == ccil_jax._HOMES
 
 
-def test_the_readme_draws_the_folders_in_the_order_of_their_imports() -> None:
+def test_the_documentation_draws_the_folders_in_the_order_of_their_imports() -> None:
     """From top to bottom; the ground, which others import from, stands last."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    drawing = text.partition("## Architecture")[2].split("```")[1]
+    drawing = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("```")[1]
     for package, wings in WINGS.items():
         section = re.search(rf"^{package}/.*?(?=^\S|\Z)", drawing, re.MULTILINE | re.DOTALL)
         assert section

@@ -106,6 +106,7 @@ def pipeline(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An expert, its demonstrations, and malm on them, all tiny: folders `expert` and `malm`, file `expert.npz`."""
     folder = tmp_path_factory.mktemp("pipeline")
     made = ["--env", "Swimmer", "--out", f"{folder}/expert.npz", "--run-dir", f"{folder}/expert", *TINY]
+    made += ["--export", f"{folder}/policy.npz"]
     assert expert.main([*made, "--num-trajectories", "4", "--cost-limit", "20"]) == 0
     assert train.main(malm(folder)) == 0
     return folder
@@ -186,14 +187,42 @@ def test_evaluate_records_what_expert_recorded(
     assert entry["versions"]["ccil_jax"] == ccil_jax.__version__
 
 
+def test_the_expert_can_be_had_from_its_file(
+    pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Evaluated, recorded and exported again, without its run folder: the same policy, but for float32's rounding."""
+    demonstrations = load_demonstrations(pipeline / "expert.npz")
+    settings = ["--episodes", "3", "--seed", str(demonstrations.metadata["episode_seed"] - 1)]
+    written = ["--record", f"{tmp_path}/same.npz", "--num-trajectories", "4", "--export", f"{tmp_path}/again.npz"]
+    given = ["--policy", f"{pipeline}/policy.npz", *settings, "--out", f"{tmp_path}/evaluation.json"]
+    assert evaluate.main([*given, *written]) == 0
+    assert "expert on Swimmer" in capsys.readouterr().out
+    entry = run_folder.read_json(tmp_path / "evaluation.json")["ours"]
+    row = demonstrations.metadata["evaluation"]
+    assert entry["per_seed"][0]["episode_return"] == pytest.approx(row["episode_return"], abs=1e-3)
+    assert entry["cost_limit"] == 20.0
+    same = load_demonstrations(tmp_path / "same.npz")
+    np.testing.assert_allclose(same.obs, demonstrations.obs, atol=1e-3)
+    for name in ("task", "method", "seed_index", "cost_limit", "env_options", "env_steps", "trained_with"):
+        assert same.metadata[name] == demonstrations.metadata[name], name
+    first, again = np.load(pipeline / "policy.npz"), np.load(tmp_path / "again.npz")
+    for name in first:
+        if name != "metadata":
+            np.testing.assert_allclose(again[name], first[name], rtol=1e-5, atol=1e-3, err_msg=name)
+    assert evaluate.main(["--policy", f"{tmp_path}/again.npz", "--episodes", "2", "--simulator", "original"]) == 0
+
+
 def test_any_seed_can_be_recorded(pipeline: Path, tmp_path: Path) -> None:
     stored = run_folder.read_run(pipeline / "malm")
     summary = run_folder.read_json(pipeline / "malm" / "summary.json")
     arguments = evaluate.make_parser().parse_args([f"{pipeline}/malm", "--record", "new.npz", "--seed-index", "1"])
-    facts = evaluate.describe_recording(arguments, stored)
-    assert facts
+    trained = {**recording.training(stored, 240), "seed_indices": [0, 1]}
+    loaded: Any = SimpleNamespace(training=trained, command=stored.facts["command"])
+    facts = evaluate.describe_recording(arguments, SimpleNamespace(run=stored), loaded, {})  # type: ignore[arg-type]
     assert facts["seed_index"] == 1
+    assert facts["evaluation"].pop("num_episodes") == summary["evaluation"]["num_episodes"]
     assert facts["evaluation"] == {name: summary["per_seed"][1][name] for name in facts["evaluation"]}
+    assert facts["evaluation"].keys() > {"episode_return_standard_error", "episode_cost_standard_error"}
     assert facts["cost_limit"] == summary["expert_cost"]
     assert facts["limit_kept"] == (facts["evaluation"]["episode_cost"] <= summary["expert_cost"])
     assert facts["command"] == f"{stored.facts['command']}\n{command()}"

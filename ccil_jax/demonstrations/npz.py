@@ -6,6 +6,7 @@ what the header of an array says about its size, which can be more than the file
 
 import contextlib
 import io
+import json
 import lzma
 import os
 import struct
@@ -127,6 +128,20 @@ def keys_of(source: Path | BinaryIO) -> frozenset[str]:
             return frozenset(name.removesuffix(".npy") for name in archive.namelist())
     except _DAMAGE:
         return frozenset()
+
+
+def json_object(array: np.ndarray, where: str, remedy: str) -> dict[str, Any]:
+    """The JSON object that an array holds as text. Raises `ArchiveError`, which calls the array `where`."""
+    try:
+        if array.nbytes > MAX_METADATA_BYTES or (array.dtype != np.uint8 and array.ndim):
+            raise ValueError("not a text of reasonable length")
+        text = array.tobytes().decode() if array.dtype == np.uint8 else str(array.astype(np.str_)[()])
+        found = json.loads(text.removeprefix("\ufeff"))  # some editors begin a text with a byte order mark
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise ArchiveError(f"{where} is not a JSON object as text; {remedy}")
+    return found
 
 
 def write(path: Path, arrays: Mapping[str, Any]) -> None:

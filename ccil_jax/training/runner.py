@@ -55,6 +55,7 @@ class Loaded:
 
     config: Config
     actor: Actor  # [num_seeds]-leading
+    env_steps: int  # of each seed so far
 
 
 def train(
@@ -326,7 +327,7 @@ def load(config: Config, env: Environment, checkpoint_dir: Path, num_seeds: int)
             "history": checkpoints.structure(step)["history"],
         }
         saved = checkpoints.restore(step, like)
-    return Loaded(config=config, actor=saved["state"].actor)
+    return Loaded(config=config, actor=saved["state"].actor, env_steps=step * config.steps_per_iteration)
 
 
 def _structure_of_state(config: Config, env: Environment, num_seeds: int) -> GuardedState:

@@ -1,11 +1,15 @@
-"""Evaluates a finished run: its policies play fresh episodes, in our simulator or in the original one."""
+"""Evaluates policies, of a run or of a file: they play fresh episodes, in our simulator or in the original one."""
 
 import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import Config
 from envs.registry import TaskInfo
-from experiments.runs import run_folder, summary
+from experiments.cli.command_line import command
+from experiments.policies.policy_file import PolicyFile
+from experiments.runs import recording, run_folder, summary
 from experiments.runs.environments import build_environment
 from experiments.runs.provenance import provenance
 from experiments.runs.run_folder import Run
@@ -24,13 +28,29 @@ class Settings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Loaded:
-    """The policies of a run, ready to act."""
+    """Policies of one training, ready to act."""
 
-    run: Run
+    source: Path  # the folder of the run, or the file of the policies
     task: TaskInfo
     env: Any
-    config: Config
-    actor: Any  # `ccil_jax.acting.rollout.Actor`, [num_seeds]-leading
+    config: Config  # of the policies; of a file it says no more than what their networks are
+    actor: Any  # `ccil_jax.acting.rollout.Actor`, [num_policies]-leading
+    training: Mapping[str, Any]  # `recording.training`, and `seed_indices`: the seed of each policy
+    levels: Mapping[str, float | None]  # of the demonstrations, see `summary.levels_of`
+    command: str  # those that made the policies, one a line
+
+    @property
+    def num_policies(self) -> int:
+        """How many policies there are."""
+        return len(self.training["seed_indices"])
+
+    def only(self, index: int) -> "Loaded":
+        """The policy `index` alone."""
+        import jax
+
+        training = {**self.training, "seed_indices": [self.training["seed_indices"][index]]}
+        actor = jax.tree.map(lambda leaf: leaf[index : index + 1], self.actor)
+        return dataclasses.replace(self, actor=actor, training=training)
 
 
 def load(run: Run) -> Loaded:
@@ -44,7 +64,42 @@ def load(run: Run) -> Loaded:
 
     env = build_environment(task.name, run.facts["physics"], run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
-    return Loaded(run=run, task=task, env=env, config=loaded.config, actor=loaded.actor)
+    return of_run(run, env, loaded.config, loaded.actor, loaded.env_steps)
+
+
+def of_run(run: Run, env: Any, config: Config, actor: Any, env_steps: int) -> Loaded:
+    """The policies `actor` of a run on `env`, whose training took `env_steps` for each seed."""
+    return Loaded(
+        source=run.folder.resolve(),
+        task=run_folder.task_of(run),
+        env=env,
+        config=config,
+        actor=actor,
+        training={**recording.training(run, env_steps), "seed_indices": list(range(run.facts["num_seeds"]))},
+        levels=summary.levels_of(run.facts),
+        command=run.facts["command"],
+    )
+
+
+def load_file(file: PolicyFile, task: TaskInfo) -> Loaded:
+    """Builds `task`, which the file names, and takes the policies from the file.
+
+    Raises:
+        UserError: the task cannot be built, or the policies do not fit it.
+    """
+    training = file.training
+    env = build_environment(task.name, training["physics"], training["env_options"])
+    file.check_sizes(env.obs_dim, env.action_dim)
+    return Loaded(
+        source=file.path.resolve(),
+        task=task,
+        env=env,
+        config=file.config,
+        actor=file.actor(),
+        training=training,
+        levels=summary.levels_of(file.metadata["levels"]),
+        command=str(file.metadata.get("command")),
+    )
 
 
 def play(loaded: Loaded, settings: Settings) -> Any:
@@ -56,13 +111,21 @@ def play(loaded: Loaded, settings: Settings) -> Any:
         "num_episodes": settings.num_episodes,
         "seed": settings.seed,
         "deterministic": settings.deterministic,
-        "draws": [0] * loaded.run.facts["num_seeds"] if settings.shared_episodes else None,
+        "draws": [0] * loaded.num_policies if settings.shared_episodes else None,
     }
     if settings.simulator == "ours":
         return evaluation.evaluate(loaded.config, loaded.actor, loaded.env, **of_episodes)
-    contact_cost = loaded.run.facts["env_options"].get("contact_cost", True)
+    contact_cost = loaded.training["env_options"].get("contact_cost", True)
     return original_simulator.evaluate(
         loaded.config, loaded.actor, loaded.env, contact_cost=contact_cost, **of_episodes
+    )
+
+
+def only(episodes: Any, index: int) -> Any:
+    """The episodes of the policy `index` alone, [1, num_episodes]."""
+    return dataclasses.replace(
+        episodes,
+        **{f.name: getattr(episodes, f.name)[index : index + 1] for f in dataclasses.fields(episodes)},
     )
 
 
@@ -74,10 +137,10 @@ def judge(loaded: Loaded, settings: Settings, episodes: Any) -> tuple[dict[str, 
     from ccil_jax.acting import evaluation
 
     random = evaluation.random_policy(loaded.env, num_episodes=settings.num_episodes, seed=settings.seed)
-    reference = summary.make_reference(loaded.run.facts, random, loaded.run.config.prescribed_limit)
+    reference = summary.make_reference(loaded.levels, random, _prescribed_limit(loaded))
     rows = summary.per_seed_scores(episodes, None, reference)
     return {
-        "run": str(loaded.run.folder.resolve()),
+        "run": str(loaded.source),
         **dataclasses.asdict(settings),
         **provenance(),
         **dataclasses.asdict(reference),
@@ -87,11 +150,20 @@ def judge(loaded: Loaded, settings: Settings, episodes: Any) -> tuple[dict[str, 
     }, reference
 
 
+def _prescribed_limit(loaded: Loaded) -> float | None:
+    """The limit that the user gave for the training; None where it had none, or took it from demonstrations."""
+    limit: float | None = loaded.training["cost_limit"] if loaded.levels["expert_cost"] is None else None
+    return limit
+
+
 def facts_of(loaded: Loaded, settings: Settings) -> dict[str, Any]:
-    """The metadata of exported policies, which says how the episodes in the file were played."""
+    """The metadata of exported policies: how they were trained, and how the episodes in the file were played."""
     return {
         "task": loaded.task.name,
         "original": loaded.task.original,
         **dataclasses.asdict(settings),
         **provenance(),
+        "command": f"{loaded.command}\n{command()}",
+        "training": dict(loaded.training),
+        "levels": dict(loaded.levels),
     }

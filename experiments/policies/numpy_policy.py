@@ -8,7 +8,7 @@ import numpy as np
 from ccil_jax.config import Config
 
 _LAYER = ("kernel", "bias")
-_CLIP = 5.0  # of normalised observations, as in ccil_jax.acting.running_statistics
+CLIP = 5.0  # of normalised observations, as in ccil_jax.acting.running_statistics
 _MIN_STD = 1e-2
 _LOG_STD_RANGE = (-5.0, 2.0)  # of squashed policies, as in ccil_jax.acting.networks
 _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -46,7 +46,7 @@ class NumpyPolicy:
         obs_dim = len(self._layers[0][0])
         self._mean, self._std, self._clip = np.zeros(obs_dim), np.ones(obs_dim), np.inf
         if (statistics := actor.obs_statistics) is not None:
-            count, self._clip = float(statistics.count), _CLIP
+            count, self._clip = float(statistics.count), CLIP
             self._mean = np.asarray(statistics.mean, np.float64)
             variance = np.asarray(statistics.sum_squares, np.float64) / max(count, 1.0)
             self._std = np.maximum(np.sqrt(variance), _MIN_STD) if count > 0 else np.ones_like(variance)

@@ -34,10 +34,10 @@ def find_seed(run: Run, rows: Sequence[dict[str, Any]], seed_index: int | None) 
     Args:
         run: whose policies there are.
         rows: of its seeds, from summary.json.
-        seed_index: what a person has chosen.
+        seed_index: what a person has chosen, a seed of the run.
 
     Raises:
-        UsageError: there is no such seed, or none keeps the limit.
+        UsageError: no seed keeps the limit.
     """
     if seed_index is None:
         limit = cost_limit(run)
@@ -47,8 +47,6 @@ def find_seed(run: Run, rows: Sequence[dict[str, Any]], seed_index: int | None) 
             raise UsageError(
                 f"--record: no seed keeps the cost limit {limit:g} ({costs}); choose one by --seed-index N"
             )
-    if seed_index not in [row["seed"] for row in rows]:
-        raise UsageError(f"--seed-index {seed_index}: the run has {len(rows)} seed(s); give 0 to {len(rows) - 1}")
     return seed_index
 
 
@@ -72,38 +70,59 @@ def read_summary(run: Run) -> dict[str, Any]:
     return summary
 
 
-def facts(run: Run, summary: Mapping[str, Any], seed_index: int, command: str) -> dict[str, Any]:
-    """The metadata of demonstrations by one seed of a run.
+def training(run: Run, env_steps: int | None) -> dict[str, Any]:
+    """How the policies of a run were trained, for the metadata of files that hold them or their episodes.
 
-    Args:
-        run: of the policy.
-        summary: the content of its summary.json.
-        seed_index: the seed.
-        command: the commands that made the demonstrations, one a line.
+    `env_steps` is how long, None where the run is not finished.
     """
-    (row,) = [row for row in summary["per_seed"] if row["seed"] == seed_index]
-    limit = cost_limit(run)
     return {
-        **run.facts["env_options"],  # here earlier versions look for them; the facts below come first
         "task": run.facts["task"],
         "method": run.config.method,
-        "cost_limit": limit,
-        "limit_kept": None if limit is None else row["episode_cost"] <= limit,
+        "cost_limit": cost_limit(run),
         "env_options": run.facts["env_options"],
         "physics": run.facts["physics"],
-        "env_steps": summary["env_steps"],
+        "env_steps": env_steps,
         "seed": run.facts["seed"],
-        "seed_index": seed_index,
-        "evaluation": {name: row[name] for name in _SCORES},
-        "random_policy": {name: summary[f"random_{name}"] for name in ("return", "cost")},
         "trained_with": {name: run.facts.get(name) for name in ("versions", "git_commit")},
+    }
+
+
+def facts(
+    trained: Mapping[str, Any], scores: Mapping[str, Any], seed_index: int, num_episodes: int | None, command: str
+) -> dict[str, Any]:
+    """The metadata of demonstrations by one seed of a training.
+
+    Args:
+        trained: what `training` says of it.
+        scores: an evaluation: `per_seed`, `random_return` and `random_cost`, as in summary.json.
+        seed_index: the seed that acts, as it is called in `per_seed`.
+        num_episodes: of each seed in the evaluation; None where an earlier version did not say so.
+        command: the commands that made the demonstrations, one a line.
+    """
+    (row,) = [row for row in scores["per_seed"] if row["seed"] == seed_index]
+    limit = trained["cost_limit"]
+    errors = {error: row.get(error) for name in _SCORES[:2] if (error := f"{name}_standard_error")}
+    return {
+        **trained["env_options"],  # here earlier versions look for them; the facts below come first
+        **trained,
+        "limit_kept": None if limit is None else row["episode_cost"] <= limit,
+        "seed_index": seed_index,
+        "evaluation": {name: row[name] for name in _SCORES} | errors | {"num_episodes": num_episodes},
+        "random_policy": {name: scores[f"random_{name}"] for name in ("return", "cost")},
         **provenance(),
         "command": command,
     }
 
 
 def record(
-    config: Config, agents: Any, env: Any, *, num_trajectories: int, episode_seed: int, facts: Mapping[str, Any]
+    config: Config,
+    agents: Any,
+    env: Any,
+    *,
+    num_trajectories: int,
+    episode_seed: int,
+    seed_index: int,
+    facts: Mapping[str, Any],
 ) -> Demonstrations:
     """Records episodes of one seed's policy.
 
@@ -113,7 +132,8 @@ def record(
         env: the task.
         num_trajectories: episodes to record.
         episode_seed: of the episodes.
-        facts: the metadata; its `seed_index` says which seed acts.
+        seed_index: which of the policies acts.
+        facts: the metadata.
     """
     import jax
 
@@ -121,7 +141,7 @@ def record(
 
     return evaluation.record(
         config,
-        jax.tree.map(lambda leaf: leaf[facts["seed_index"]], agents),
+        jax.tree.map(lambda leaf: leaf[seed_index], agents),
         env,
         num_episodes=num_trajectories,
         seed=episode_seed,

@@ -66,19 +66,21 @@ def expert_levels(demonstrations: Demonstrations | None) -> dict[str, float | No
     }
 
 
-def make_reference(levels: Mapping[str, Any], random: Any, cost_limit: float | None) -> Reference:
+def levels_of(facts: Mapping[str, Any]) -> dict[str, float | None]:
+    """As `expert_levels`, from a config.json or the metadata of policies; earlier versions wrote no standard errors."""
+    return {name: facts.get(name) for name in expert_levels(None)}
+
+
+def make_reference(levels: Mapping[str, float | None], random: Any, cost_limit: float | None) -> Reference:
     """The levels that a run is compared with.
 
     Args:
-        levels: from `expert_levels`, or the content of a config.json; earlier versions wrote no standard errors there.
+        levels: from `expert_levels` or `levels_of`.
         random: evaluation of the random policy, with arrays [1, num_episodes].
         cost_limit: the prescribed limit, where the method has one.
     """
     return Reference(
-        expert_return=levels["expert_return"],
-        expert_cost=levels["expert_cost"],
-        expert_return_standard_error=levels.get("expert_return_standard_error"),
-        expert_cost_standard_error=levels.get("expert_cost_standard_error"),
+        **levels,
         random_return=float(np.mean(random.episode_return)),
         random_cost=float(np.mean(random.episode_cost)),
         random_return_standard_error=standard_error(random.episode_return[0]),
