@@ -58,6 +58,10 @@ lint: $(VENV)/.dev ## style
 types: $(VENV)/.dev ## types
 	$(RUN) mypy
 
+.PHONY: docs
+docs: $(VENV)/.dev ## the documentation as a site, in build/site
+	NO_MKDOCS_2_WARNING=1 $(RUN) mkdocs build --strict
+
 .PHONY: format
 format: $(VENV)/.dev ## reformat, and fix what can be fixed
 	$(RUN) ruff check --fix .

@@ -1,6 +1,9 @@
 """The pages: their links lead somewhere, and the README stays what is read in two minutes."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -36,5 +39,26 @@ def test_the_readme_is_short_and_leads_to_every_page() -> None:
     assert len(text.splitlines()) <= 150
     assert len(text.split()) <= 1200
     linked = set(LINK.findall(text))
-    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} - {"docs/ablations_paper.md"}
+    pages = {f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")} - {
+        "docs/index.md",
+        "docs/ablations_paper.md",
+    }
     assert pages <= {target.partition("#")[0] for target in linked}
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    """Strictly: every page is in the navigation, every link and anchor exists, every name of the API is documented."""
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    mathematics = (tmp_path / "mathematics" / "index.html").read_text(encoding="utf-8")
+    assert mathematics.count("<math") == (ROOT / "docs" / "mathematics.md").read_text(encoding="utf-8").count("```math")
+    api = (tmp_path / "api" / "index.html").read_text(encoding="utf-8")
+    import ccil_jax
+    import envs
+
+    for package in (ccil_jax, envs):
+        for name in set(package.__all__) - {"__version__", "PHYSICS"}:
+            assert f'id="{package.__name__}.{name}"' in api, name
