@@ -22,20 +22,19 @@ is replaced once. An interrupted sweep goes on with --resume, and does not repea
 import argparse
 import functools
 import itertools
-import json
 import sys
-import tomllib
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.errors import UserError
-from experiments.cli import command_line
+from experiments.cli import command_line, settings_file
 from experiments.cli.command_line import Parser, UsageError
 from experiments.cli.names import safe_name
+from experiments.cli.settings_file import text
 from experiments.sweeps import comparison, dispatch
-from experiments.sweeps.variants import Variant, make_variant, run_of, text
+from experiments.sweeps.variants import Variant, make_variant, run_of
 
 _KEYS = ("env", "method", "fixed", "grid")
 _LONGEST_NAME = 120  # of a variant's folder; longer names are replaced by numbers
@@ -59,22 +58,7 @@ def make_parser() -> Parser:
 
 def read_spec(path: Path) -> dict[str, Any]:
     """The content of a spec; `fixed` and `grid` are always there. Raises `UsageError` for a missing or wrong file."""
-    read_json = functools.partial(json.loads, object_pairs_hook=_without_doubles)
-    loaders: dict[str, Callable[[str], Any]] = {".toml": tomllib.loads, ".json": read_json}
-    if path.suffix not in loaders:
-        raise UsageError(f"SPEC {path}: give a file named *.toml or *.json")
-    try:
-        spec = loaders[path.suffix](path.read_text(encoding="utf-8-sig"))  # editors may write a byte order mark
-    except OSError as error:
-        raise UsageError(f"SPEC {path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise UsageError(f"SPEC {path}: not text in UTF-8; save it with that encoding") from None
-    except RecursionError:
-        raise UsageError(f"SPEC {path}: nested too deeply; give a table with {', '.join(_KEYS)}") from None
-    except ValueError as error:
-        raise UsageError(f"SPEC {path}: not {path.suffix[1:].upper()} ({error})") from None
-    if not isinstance(spec, dict):
-        raise UsageError(f"SPEC {path}: give a table with {', '.join(_KEYS)}")
+    spec = settings_file.read(path, "SPEC")
     if unknown := [key for key in spec if key not in _KEYS]:
         raise UsageError(f"SPEC {path}: '{unknown[0]}': unknown; give env, method, and the rest under fixed or grid")
     spec = {"fixed": {}, "grid": {}, **spec}
@@ -88,14 +72,6 @@ def read_spec(path: Path) -> dict[str, Any]:
         spec[table] = dict(zip(fields, spec[table].values(), strict=True))
     _check_grid(path, spec)
     return spec
-
-
-def _without_doubles(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object from its entries. Of two entries with the same name, Python would silently keep the last."""
-    names = [name for name, _ in pairs]
-    if doubles := [name for name in names if names.count(name) > 1]:
-        raise ValueError(f"'{doubles[0]}' is there twice")
-    return dict(pairs)
 
 
 def _check_grid(path: Path, spec: Mapping[str, Any]) -> None:

@@ -136,6 +136,8 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "output not writable": ((*TRAIN, "--out", "/proc/run"), "--out /proc/run: cannot be written"),
     "output holds a run": ((*TRAIN, "--out", "old"), "--out old: already holds a run; continue it with --resume"),
     "output not empty": ((*TRAIN, "--out", "full"), "--out full: not empty"),
+    "config of nothing": ((*TRAIN, "--config", "none.toml"), "--config none.toml: cannot be read (No such file"),
+    "config and resume": ((*TRAIN, "--resume", "--config", "a.toml"), "--config a.toml: a run that is resumed has its"),
     "nothing to resume": ((*TRAIN, "--resume"), "--resume: run holds no run"),
     "resume what": (("train", "--resume"), "--resume: needs --out"),
     "damaged run": (("train", "--resume", "--out", "old"), "config.json: keys are missing"),

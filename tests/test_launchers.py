@@ -1,6 +1,7 @@
 """Launchers: options, the choice of the expert, and one tiny pipeline for real."""
 
 import dataclasses
+import json
 import re
 import shutil
 from collections.abc import Iterator
@@ -185,6 +186,52 @@ def test_evaluate_records_what_expert_recorded(
     entry = run_folder.read_json(tmp_path / "evaluation.json")["ours"]
     assert entry["run"] == str(pipeline / "expert")
     assert entry["versions"]["ccil_jax"] == ccil_jax.__version__
+
+
+def test_a_run_can_be_done_again_from_its_config_file(pipeline: Path, tmp_path: Path) -> None:
+    """The same setup and hyperparameters as from the command line, and an option of one's own comes first."""
+    parser, out = train.make_parser(), ["--out", f"{tmp_path}/new"]
+    first = train.make_plan(parser.parse_args([*malm(pipeline), "--physics", "native", *out]))
+    again = train.make_plan(parser.parse_args(["--config", f"{pipeline}/malm/config.json", *out]))
+    assert (again.setup, again.config, again.preset) == (first.setup, first.config, first.preset)
+    seeds = train.make_plan(parser.parse_args(["--config", f"{pipeline}/malm/config.json", *out, "--num-seeds", "7"]))
+    assert seeds.setup.num_seeds == 7
+
+    options = {"method": "malm", "env": "Swimmer", "demos": f"{pipeline}/expert.npz", "hidden_sizes": [5, 6]}
+    toml = "".join(f"{name} = {json.dumps(value)}\n" for name, value in options.items())
+    for name, text in (("run.toml", toml), ("run.json", json.dumps(options))):
+        (tmp_path / name).write_text(text)
+        given = ["--config", f"{tmp_path}/{name}", "--preset", "tiny", "--env-steps", "80", *out]
+        plan = train.make_plan(parser.parse_args(given))
+        assert (plan.config.hidden_sizes, plan.config.env_steps, plan.preset) == ((5, 6), 80, "tiny")
+        assert plan.setup.demonstrations_path == pipeline / "expert.npz"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('metod = "malm"', "unrecognized arguments: --metod=malm"),
+        ('method = "malm"\nseed = -1', "--seed: -1"),
+        ('method = "malm"\n[fixed]\nseed = 1', "fixed: a table; give the options of `train` side by side"),
+        ("method = malm", "not TOML"),
+        ('out = "elsewhere"', "unrecognized arguments: --out=elsewhere"),
+    ],
+)
+def test_a_wrong_config_file_is_named(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "run.toml"
+    path.write_text(content)
+    with pytest.raises(UsageError) as refused:
+        train.make_plan(train.make_parser().parse_args(["--config", str(path), "--env", "Swimmer"]))
+    assert str(refused.value).startswith(f"--config {path}: " if "TOML" not in message else f"--config {path}")
+    assert message in str(refused.value)
+
+
+def test_a_config_file_whose_demonstrations_are_gone_says_so(pipeline: Path, tmp_path: Path) -> None:
+    content = run_folder.read_json(pipeline / "malm" / "config.json")
+    content["demonstrations"]["file"] = f"{tmp_path}/gone.npz"
+    run_folder.write_json(tmp_path / "config.json", content)
+    with pytest.raises(UsageError, match=r"gone\.npz is no longer the file that this run learnt from; give it by"):
+        train.make_plan(train.make_parser().parse_args(["--config", f"{tmp_path}/config.json"]))
 
 
 def test_the_expert_can_be_had_from_its_file(

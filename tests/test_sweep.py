@@ -115,7 +115,7 @@ def test_variants_share_what_they_read(tmp_path: Path) -> None:
         ("s.toml", "a = = 1", "not TOML (Invalid value (at line 1"),
         ("s.json", "{", "not JSON (Expecting property name"),
         ("s.json", '{"grid": {"seed": [1, 2], "seed": [3]}}', "not JSON ('seed' is there twice)"),
-        ("s.json", "[]", "give a table with env, method"),
+        ("s.json", "[]", "give a table of fields"),
         ("s.json", "[" * 100_000, "nested too deeply"),
     ],
 )

@@ -2,11 +2,11 @@
 
 import argparse
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn
 
 from ccil_jax.config import Config, field_names, with_limit_of
 from ccil_jax.demonstrations.trajectories import Demonstrations, check_matches, check_time_limit, load_demonstrations
@@ -104,6 +104,20 @@ def add_options(parser: Parser, *, with_method: bool = True) -> None:
         "--num-demos", default=absent, type=command_line.positive, metavar="K", help="use the first K trajectories only"
     )
     options.add_config_options(parser, options.DEFAULTS["preset"])
+
+
+class _OptionParser(Parser):
+    """A parser for options that stand in a file: errors are raised, and do not end the process."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(" ".join(message.split()).removeprefix("argument "))
+
+
+def parse_options(given: Sequence[str]) -> dict[str, Any]:
+    """Options of `train` as they are typed, `--name=value` each, by name. Raises `UsageError` for a wrong one."""
+    parser = _OptionParser("train", "")
+    add_options(parser)
+    return vars(parser.parse_args(given))
 
 
 def plan_of(

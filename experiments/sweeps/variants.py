@@ -12,13 +12,14 @@ import hashlib
 import json
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from ccil_jax.config import relevant
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
 from ccil_jax.training.filesystem import file_sha256
-from experiments.cli.command_line import Parser, UsageError
+from experiments.cli.command_line import UsageError
 from experiments.cli.names import safe_name
+from experiments.cli.settings_file import text
 from experiments.runs import plans, run_folder
 from experiments.runs.plans import RunPlan, static_values
 
@@ -44,13 +45,6 @@ class Job:
 
     folder: Path
     variants: tuple[Variant, ...]
-
-
-class _OptionParser(Parser):
-    """A parser for options that stand in a file: errors are raised, and do not end the process."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(" ".join(message.split()).removeprefix("argument "))
 
 
 def make_variant(
@@ -84,19 +78,10 @@ def make_variant(
 def _variant(
     name: str, given: Sequence[str], out: Path, load: Callable[[Path], Demonstrations], *, alone: bool = False
 ) -> Variant:
-    parser = _OptionParser("train", "")
-    plans.add_options(parser)
     folder = out / "runs" / name
     resume = (folder / "config.json").is_file()
-    plan = plans.plan_of(vars(parser.parse_args(given)), folder, resume=resume, load=load)
+    plan = plans.plan_of(plans.parse_options(given), folder, resume=resume, load=load)
     return Variant(name=name, options=tuple(given), plan=plan, alone=alone)
-
-
-def text(value: Any) -> str:
-    """A value as it is typed on a command line."""
-    if isinstance(value, list | tuple):
-        return ",".join(map(text, value))
-    return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
 def check_unchanged(variant: Variant) -> None:
