@@ -206,6 +206,11 @@ class Config:
         "what the critics learn: gae is advantage + value with the advantage's own lambda (authors), td_lambda the "
         "lambda-return with critic_lambda, so that advantages can lean on the critics without spoiling what they learn",
     )
+    normalize_values: bool = _static(
+        False,
+        "whether the critics' targets are shifted and scaled by their running mean and deviation for the networks, so "
+        "that returns of hundreds are learnt as fast as returns of 1 (van Hasselt et al. 2016)",
+    )
     critic_epochs: int = _static(5, "passes of both critics over each batch (authors)")
     critic_minibatch_size: int = _static(
         128,

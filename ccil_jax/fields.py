@@ -36,6 +36,7 @@ class Fields(TypedDict, total=False):
     policy_average: str
     critic_intervals: int
     critic_target: str
+    normalize_values: bool
     critic_epochs: int
     critic_minibatch_size: int
     standardize_cost_advantage: bool

@@ -73,6 +73,7 @@ OTHER: dict[str, Any] = {  # another value of each static field that narrows wha
     "cloning_updates": 300,
     "warmup_iterations": 2,
     "critic_target": "td_lambda",
+    "normalize_values": True,
     "policy_average": "polynomial_decay",
 }
 # How long, when to give up, and what the demonstrations are: not of an iteration.

@@ -105,3 +105,33 @@ def test_an_optimizer_may_use_the_parameters() -> None:
         optimizer=decaying,
     )
     np.testing.assert_allclose(found.params, [0.95], rtol=1e-6)
+
+
+def test_a_normalized_critic_learns_what_a_plain_one_does_of_targets_by_hand() -> None:
+    """Two fits: the second has the mean and the deviation of the targets of both."""
+    rng = np.random.default_rng(0)
+    obs, key = jnp.asarray(rng.normal(size=(40, 3)), jnp.float32), jax.random.key(0)
+    first, second = 300 + 50 * rng.normal(size=(2, 40)).astype(np.float32)
+    options: dict[str, Any] = {"learning_rate": 0.01, "num_epochs": 3, "minibatch_size": 8}
+
+    def apply(params: jax.Array, obs: jax.Array) -> jax.Array:
+        return obs @ params
+
+    normalized: Critic = regression.init_normalized(jnp.zeros(3), 0.01)
+    plain = regression.init(jnp.zeros(3), 0.01)
+    seen = np.zeros(0)
+    for target in (first, second):
+        seen = np.append(seen, target)
+        by_hand = jnp.asarray((target - seen.mean()) / seen.std(), jnp.float32)
+        plain, plain_loss = regression.fit(apply, plain, obs, by_hand, key, **options)
+        normalized, loss = regression.fit(apply, normalized, obs, jnp.asarray(target), key, **options)
+        np.testing.assert_allclose(normalized.params, plain.params, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(loss, plain_loss * seen.var(), rtol=1e-4)
+        values = regression.predict(apply, normalized, obs)
+        np.testing.assert_allclose(values, seen.mean() + seen.std() * apply(plain.params, obs), rtol=1e-4)
+
+
+def test_before_its_first_fit_a_normalized_critic_is_its_network() -> None:
+    critic = regression.init_normalized(jnp.arange(3.0), 0.01)
+    obs = jnp.ones((2, 3))
+    np.testing.assert_array_equal(regression.predict(lambda params, obs: obs @ params, critic, obs), [3.0, 3.0])

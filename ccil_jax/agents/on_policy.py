@@ -159,7 +159,8 @@ def init(parts: Parts, key: jax.Array) -> AgentState:
     config, env = parts.config, parts.env
     key, policy_key, critic_key, reward_key, env_key = jax.random.split(key, 5)
     critic_params = jax.vmap(parts.critic.init)(jax.random.split(critic_key, 2))
-    init_critic = functools.partial(regression.init, optimizer=parts.optimizer)
+    kind = regression.init_normalized if config.normalize_values else regression.init
+    init_critic = functools.partial(kind, optimizer=parts.optimizer)
     zero = jnp.zeros(())
     actor = first_actor(parts, policy_key)
     state = AgentState(
@@ -349,7 +350,9 @@ def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Bat
         return running_statistics.normalize(state.actor.obs_statistics, obs)
 
     def values(obs: jax.Array) -> jax.Array:
-        return jax.vmap(parts.critic.apply, in_axes=(0, None))(state.critics.params, obs)
+        return jax.vmap(functools.partial(regression.predict, parts.critic.apply), in_axes=(0, None))(
+            state.critics, obs
+        )
 
     obs = normalize(transition.obs)
     reward = parts.reward_model.reward(state.reward_model, transition)
