@@ -8,6 +8,7 @@ the policies of all seeds, or that of --seed-index, are also written to files th
 
 import argparse
 import dataclasses
+import importlib.util
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -72,7 +73,7 @@ def _add_files(parser: Parser) -> None:
         type=Path,
         metavar="FILE",
         help="also write the policies of all seeds, or that of --seed-index: as NumPy arrays, together with the "
-        "results of these episodes (.npz), or as a StableHLO program (.stablehlo)",
+        "results of these episodes (.npz), as an ONNX model (.onnx), or as a StableHLO program (.stablehlo)",
     )
     parser.add_argument(
         "--record",
@@ -198,7 +199,7 @@ def check_policy(arguments: argparse.Namespace, config: Config) -> None:
     if arguments.simulator == "original":
         raise UsageError(f"--simulator original: {reason}; leave it out")
     for file in arguments.export:
-        if file.suffix == ".npz":
+        if file.suffix in (".npz", ".onnx"):
             raise UsageError(f"--export {file}: {reason}; give a file named *.stablehlo")
 
 
@@ -209,8 +210,10 @@ def check_files(arguments: argparse.Namespace, path: Path | None) -> list[tuple[
         UsageError: a file's name has an unknown ending, or the file would replace another.
     """
     for file in arguments.export:
-        if file.suffix not in (".npz", ".stablehlo"):
-            raise UsageError(f"--export {file}: unknown kind of file; end its name with .npz or .stablehlo")
+        if file.suffix not in (".npz", ".onnx", ".stablehlo"):
+            raise UsageError(f"--export {file}: unknown kind of file; end its name with .npz, .onnx or .stablehlo")
+        if file.suffix == ".onnx" and importlib.util.find_spec("onnx") is None:
+            raise UsageError(f"--export {file}: needs the package onnx; `pip install 'ccil_jax[onnx]'`")
     if arguments.record and arguments.record.suffix != ".npz":
         raise UsageError(f"--record {arguments.record}: a demonstrations file is named *.npz")
     written = [("--export", file) for file in arguments.export]
@@ -291,6 +294,8 @@ def _export(arguments: argparse.Namespace, loaded: Loaded, episodes: Any, settin
             exporting.export_numpy(
                 file, loaded.config, loaded.actor, loaded.env, episodes, evaluating.facts_of(loaded, settings)
             )
+        elif file.suffix == ".onnx":
+            exporting.export_onnx(file, loaded.config, loaded.actor, loaded.env)
         else:
             exporting.export_stablehlo(file, loaded.config, loaded.actor, loaded.env)
         print(f"policies {file}")

@@ -337,9 +337,9 @@ def test_exported_policies_are_the_learnt_ones(
         assert arrays["kernel_0"].shape == (2, env.obs_dim, *stored.config.hidden_sizes[:1])
 
     with pytest.raises(SystemExit) as end:
-        evaluate.main([f"{pipeline}/malm", "--export", "policy.onnx"])
+        evaluate.main([f"{pipeline}/malm", "--export", "policy.pt"])
     assert end.value.code == 2
-    assert "--export policy.onnx: unknown kind of file" in capsys.readouterr().err
+    assert "--export policy.pt: unknown kind of file" in capsys.readouterr().err
 
 
 def test_numpy_policy_is_the_learnt_policy() -> None:

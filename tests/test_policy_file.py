@@ -64,6 +64,38 @@ def test_policies_of_a_file_act_as_its_arrays_say(tmp_path: Path) -> None:
     np.testing.assert_allclose(policies(file.config, actor, env)[1].mode(obs[0]), mean[1, 0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("squashed", [False, True])
+@pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
+def test_onnx_acts_as_the_policies_do(tmp_path: Path, squashed: bool, activation: str) -> None:
+    """1,000 observations, with noise and without: the model in its own runtime against JAX."""
+    import jax
+    import jax.numpy as jnp
+    import onnxruntime
+
+    import envs
+    from ccil_jax.acting import networks
+    from ccil_jax.acting.rollout import act
+    from experiments.policies import exporting
+
+    random = np.random.default_rng(1)
+    other = {"kernel_1": random.normal(size=(2, 5, 4)), "bias_1": random.normal(size=(2, 4)), "action_std": None}
+    other |= {"action_center": np.zeros((2, 2)), "action_half_range": np.ones((2, 2)), "obs_clip": np.full(2, np.inf)}
+    other |= {"obs_mean": np.zeros((2, 8)), "obs_std": np.ones((2, 8))}
+    path, env = tmp_path / "policy.npz", envs.make("Swimmer")
+    npz.write(path, content(metadata={**METADATA, "activation": activation}, **(other if squashed else {})))
+    file = policy_file.read(path)
+    actor = file.actor()
+    exporting.export_onnx(tmp_path / "policy.onnx", file.config, actor, env)
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
+    obs = random.normal(size=(1000, 8)).astype(np.float32) * 3
+    policy = networks.policy_of(file.config, env)
+    for noise in (np.zeros((1000, 2), np.float32), random.normal(size=(1000, 2)).astype(np.float32)):
+        (found,) = session.run(["action"], {"obs": obs, "noise": noise})
+        wanted = jax.vmap(lambda one, noise=noise: act(policy.apply, one, jnp.asarray(obs), jnp.asarray(noise)))(actor)
+        assert found.shape == (2, 1000, 2)
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
+
+
 def without(*keys: str) -> dict[str, Any]:
     """The metadata without an entry of the training."""
     return {**METADATA, "training": {k: v for k, v in METADATA["training"].items() if k not in keys}}  # type: ignore[attr-defined]

@@ -10,7 +10,7 @@ from ccil_jax.config import Config
 _LAYER = ("kernel", "bias")
 CLIP = 5.0  # of normalised observations, as in ccil_jax.acting.running_statistics
 _MIN_STD = 1e-2
-_LOG_STD_RANGE = (-5.0, 2.0)  # of squashed policies, as in ccil_jax.acting.networks
+LOG_STD_RANGE = (-5.0, 2.0)  # of squashed policies, as in ccil_jax.acting.networks
 _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0),
@@ -80,7 +80,7 @@ class NumpyPolicy:
         if not self._squashed:
             return x + np.exp(self._log_std) * noise
         mean, spread = np.split(x, 2)
-        smallest, largest = _LOG_STD_RANGE
+        smallest, largest = LOG_STD_RANGE
         log_std = smallest + (largest - smallest) * (np.tanh(spread) + 1) / 2
         return self._center + self._half_range * np.tanh(mean + np.exp(log_std) * noise)
 
