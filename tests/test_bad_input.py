@@ -189,6 +189,11 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "record elsewhere": ((*RECORD, "--simulator", "original"), "--simulator original: demonstrations are recorded in"),
     "record too early": (("evaluate", "half", "--record", "new.npz"), "the run in half is not finished; continue it"),
     "overwrite nothing": (("evaluate", "done", "--overwrite"), "--overwrite: for files of --export and --record"),
+    "report on what": (("report",), "RUN_DIR: give at least one folder of a run, or --policies FILE.npz"),
+    "report on no policy": (
+        ("report", "--policies", "good.npz"),
+        "good.npz: key 'kernel_0' is missing; write the file",
+    ),
     "report on nothing": (("report", "none"), "RUN_DIR none: no such folder"),
     "report on something else": (("report", "full"), "full/config.json: cannot be read"),
     "benchmark of what": (("benchmark", "--tasks", "Swimer"), "--tasks Swimer: unknown task; did you mean Swimmer?"),

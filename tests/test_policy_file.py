@@ -9,6 +9,7 @@ import pytest
 
 from ccil_jax.demonstrations import npz
 from ccil_jax.demonstrations.npz import ArchiveError
+from experiments.page import document
 from experiments.policies import policy_file
 from experiments.policies.numpy_policy import policies
 
@@ -112,6 +113,7 @@ def without(*keys: str) -> dict[str, Any]:
         ({"obs_mean": np.zeros(8)}, "do not make up a policy"),
         ({"obs_clip": np.full(2, 10.0)}, "do not make up a policy"),
         ({"kernel_0": np.zeros((0, 8, 5))}, "do not make up a policy"),
+        ({"episode_cost": np.zeros(2)}, "do not make up a policy"),
         ({"obs_clip": None}, "key 'obs_clip' is missing"),
         ({"bias_1": np.full((2, 2), np.nan)}, "'bias_1' holds something else than finite numbers"),
         ({"bias_1": np.full((2, 2), "a")}, "'bias_1' holds something else than finite numbers"),
@@ -142,3 +144,19 @@ def test_policies_fit_their_task(tmp_path: Path) -> None:
     file.check_sizes(8, 2)
     with pytest.raises(ArchiveError, match="8 observations and 2 actions, but Swimmer has 17 and 6"):
         file.check_sizes(17, 6)
+
+
+def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
+    """Their returns and costs, 3 +- 1 by hand, and an episode of each; that of an unknown task in the table alone."""
+    episodes = {
+        "episode_return": np.array([[2.0, 4.0], [2.0, 4.0]]),
+        "episode_cost": np.array([[2.0, 4.0], [5.0, 5.0]]),
+    }
+    npz.write(tmp_path / "a.npz", content(**episodes))
+    npz.write(tmp_path / "b.npz", content(metadata={**METADATA, "training": {**METADATA["training"], "task": "a:b"}}))  # type: ignore[dict-item]
+    files = [policy_file.read(tmp_path / name) for name in ("a.npz", "b.npz")]
+    page = document.page([], {}, policies=document.policies_section(files))
+    assert "<td>malm on Swimmer, seed 4</td><td>3.00 <small>&plusmn; 1.00</small></td>" in page
+    assert "<td>5.00 <small>&plusmn; 0.00</small></td><td>3.00</td><td>-</td>" in page
+    assert "<td>malm on a:b, seed 7</td><td>-</td>" in page
+    assert page.count("<canvas") == 2

@@ -21,6 +21,7 @@ from experiments import benchmark, report
 from experiments.cli.command_line import UsageError
 from experiments.page import document
 from experiments.page.entries import read_entries
+from experiments.policies import evaluating
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.metrics_file import MetricsWriter, read_metrics
 from experiments.runs.summary import Reference, aggregate_scores, scores
@@ -286,7 +287,8 @@ def test_the_episode_shown_is_said_to_be_of_the_best_seed(tmp_path: Path, monkey
     for folder in folders:
         (folder / "checkpoints").mkdir()
     calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(animation, "play_run", lambda run, *more: calls.append(more))
+    monkeypatch.setattr(evaluating, "load", lambda run: run)
+    monkeypatch.setattr(animation, "play", lambda loaded, *more: calls.append(more))
     for entry in read_entries(folders):
         document.animate(entry)
     assert calls == [

@@ -13,10 +13,9 @@ import mujoco
 import numpy as np
 
 from experiments.page import top_down
-from experiments.policies import evaluating
+from experiments.policies.evaluating import Loaded
 from experiments.policies.numpy_policy import NumpyPolicy, policies
 from experiments.runs import figures
-from experiments.runs.run_folder import Run
 
 _STEPS_PER_FRAME = 2
 
@@ -99,17 +98,16 @@ def record_poses(env: Any, policy: NumpyPolicy, *, above: bool = False, num_step
     )
 
 
-def play_run(run: Run, seed: int, name: str, caption: str) -> str:
-    """The HTML of an episode of one seed of a run: an animation, or of a task with an arena one picture from above.
+def play(loaded: Loaded, index: int, name: str, caption: str) -> str:
+    """The HTML of an episode of a policy: an animation, or of a task with an arena one picture from above.
 
     Args:
-        run: of a task that can be drawn.
-        seed: whose policy acts.
+        loaded: policies of a task that can be drawn.
+        index: of the one that acts.
         name: of the element; no other on the page has it.
         caption: says whose episode it is.
     """
-    loaded = evaluating.load(run)
-    policy = policies(loaded.config, loaded.actor, loaded.env)[seed]
+    policy = policies(loaded.config, loaded.actor, loaded.env)[index]
     if loaded.task.view != "arena":
         return to_html(record_poses(loaded.env, policy, above=loaded.task.view == "above"), name, caption)
     image = figures.png(top_down.draw(loaded.env, top_down.record(loaded.env, policy)))

@@ -7,11 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from ccil_jax.demonstrations.trajectories import standard_error
 from ccil_jax.earlier_versions import GONE
+from envs.registry import TASKS
 from experiments.cli.options import CONFIG_FIELDS
 from experiments.cli.tables import BEYOND_ERROR, bounds, marked, number
 from experiments.page.entries import Entry, choose_seed
+from experiments.policies import evaluating
 from experiments.policies.numpy_policy import is_known
+from experiments.policies.policy_file import PolicyFile
 from experiments.runs.intervals import bootstrap_interval
 
 _COLUMNS = (
@@ -71,6 +75,7 @@ def page(
     *,
     seed: int = 0,
     player: Callable[[Entry], str] | None = None,
+    policies: str = "",
 ) -> str:
     """The whole page.
 
@@ -79,22 +84,24 @@ def page(
         images: a PNG file of learning curves for each task.
         seed: of the bootstrap intervals.
         player: makes the HTML of an episode of a run, or an empty text; None leaves episodes out.
+        policies: the section about policies of files, see `policies_section`.
     """
     tasks = list(images)
+    title = f"{', '.join(tasks)}: imitation under cost constraints" if tasks else "Policies under cost constraints"
     parts = [
         "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>",
         "<meta name=viewport content='width=device-width, initial-scale=1'>",
         _PAGE,
-        f"<title>{_text(', '.join(tasks))}: imitation under cost constraints</title>",
+        f"<title>{_text(title)}</title>",
         f"<style>{_STYLE}</style></head><body>",
-        f"<h1>{_text(', '.join(tasks))}: imitation under cost constraints</h1>",
+        f"<h1>{_text(title)}</h1>",
         f"<p class=note>{_NOTE}</p>",
     ]
     if len(tasks) > 1:
         parts.append(_across_tasks(entries, seed))
     for task in tasks:
         parts += _task_section(task, [e for e in entries if e.task == task], images[task], seed, player)
-    return "\n".join([*parts, "</body></html>\n"])
+    return "\n".join([*parts, policies, "</body></html>\n"])
 
 
 def _task_section(
@@ -244,4 +251,35 @@ def animate(entry: Entry) -> str:
     from experiments.page import animation  # imports JAX, which a page without episodes does not need
 
     best, caption = choose_seed(entry)
-    return animation.play_run(entry.run, best, f"episode-{entry.number}", caption)
+    return animation.play(evaluating.load(entry.run), best, f"episode-{entry.number}", caption)
+
+
+def policies_section(files: Sequence[PolicyFile], *, animated: bool = True) -> str:
+    """A table of policies, by the episodes that were played when their files were written, and an episode of each.
+
+    Files of tasks that are not of this package stand in the table alone.
+    """
+    rows, episodes = [], []
+    for i, file in enumerate(files):
+        training, task = file.training, TASKS.get(file.training["task"])
+        for index, seed in enumerate(training["seed_indices"]):
+            label = f"{training['method']} on {training['task']}, seed {seed}"
+            scores = {name: file.episodes[name][index] for name in file.episodes}
+            cells = [_of_episodes(scores.get(name)) for name in ("episode_return", "episode_cost")]
+            steps = training.get("env_steps")
+            rows.append(
+                [_text(label), *cells, number(training["cost_limit"]), f"{steps:,}" if isinstance(steps, int) else "-"]
+            )
+            if animated and task is not None and task.view is not None:
+                from experiments.page import animation  # imports JAX
+
+                loaded = evaluating.load_file(file, task)
+                episodes.append(animation.play(loaded, index, f"policy-{i}-{index}", f"One episode of {label}."))
+    titles = ["policy", "return", "cost", "limit", "steps of training"]
+    return "\n".join(["<h2>Policies</h2>", _table(titles, rows), *episodes])
+
+
+def _of_episodes(values: np.ndarray | None) -> str:
+    if values is None or not len(values):
+        return "-"
+    return f"{number(float(np.mean(values)))} <small>&plusmn; {number(standard_error(values))}</small>"

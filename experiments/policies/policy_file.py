@@ -19,6 +19,7 @@ MAX_LAYERS = 32
 _AGAIN = "write the file again with `evaluate --export`"
 _GAUSSIAN, _SQUASHED = ("action_std",), ("action_center", "action_half_range")
 _OBSERVED = ("obs_mean", "obs_std", "obs_clip")
+_EPISODES = ("episode_return", "episode_cost")
 _TRAINING = {"task": str, "method": str, "env_options": dict, "physics": str}  # what has to be known of a training
 
 
@@ -31,6 +32,7 @@ class PolicyFile:
     layers: list[tuple[np.ndarray, np.ndarray]]  # kernels [S, from, to] and biases [S, to]
     last: dict[str, np.ndarray]  # `action_std`, or `action_center` and `action_half_range` of squashed policies
     observed: dict[str, np.ndarray]  # `obs_mean` and `obs_std` [S, obs_dim], `obs_clip` [S]
+    episodes: dict[str, np.ndarray]  # `episode_return` and `episode_cost` [S, E], of those played when it was written
 
     @property
     def squashed(self) -> bool:
@@ -104,8 +106,10 @@ def find(named: Path) -> Path:
 def read(path: Path) -> PolicyFile:
     """Reads and checks a file. Imports no JAX. Raises `ArchiveError`, which names file, key and remedy."""
     layers = [f"{kind}_{i}" for i in range(MAX_LAYERS) for kind in ("kernel", "bias")]
-    optional = frozenset({*layers[2:], *_GAUSSIAN, *_SQUASHED})
-    arrays = npz.read(path, (*layers, *_GAUSSIAN, *_SQUASHED, *_OBSERVED, "metadata"), optional=optional, remedy=_AGAIN)
+    optional = frozenset({*layers[2:], *_GAUSSIAN, *_SQUASHED, *_EPISODES})
+    arrays = npz.read(
+        path, (*layers, *_GAUSSIAN, *_SQUASHED, *_OBSERVED, *_EPISODES, "metadata"), optional=optional, remedy=_AGAIN
+    )
     metadata = npz.json_object(arrays.pop("metadata"), f"{path}: 'metadata'", _AGAIN)
     _check_metadata(path, metadata)
     for name, values in arrays.items():
@@ -126,6 +130,8 @@ def read(path: Path) -> PolicyFile:
             _same(shapes[name], shape)
         _same(shapes["obs_mean"], (num, obs_dim))
         _same(shapes["obs_std"], (num, obs_dim))
+        for name in set(_EPISODES) & arrays.keys():
+            _same((len(shapes[name]), shapes[name][:1]), (2, (num,)))
         if last == _GAUSSIAN:
             _same(tuple(arrays["obs_clip"]), (CLIP,) * num)
         _same((depth > 1, num > 0, len(metadata["training"]["seed_indices"])), (True, True, num))
@@ -140,6 +146,7 @@ def read(path: Path) -> PolicyFile:
         layers=[(arrays[f"kernel_{i}"], arrays[f"bias_{i}"]) for i in range(depth)],
         last={name: arrays[name] for name in last},
         observed={name: arrays[name] for name in _OBSERVED},
+        episodes={name: arrays[name] for name in _EPISODES if name in arrays},
     )
 
 
