@@ -81,7 +81,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     # Costs are rare in these tasks (some 25 visits of a hazard in 20,000 steps), hence large batches. What matters most
     # is a cost critic that sees where a hazard begins (docs/ablations.md): with intervals for the critics and cost
-    # advantages that lean on them, CarGoal1 is as good after 1.3 million steps as it was after 8 million without.
+    # advantages that lean on them, CarGoal1's return passes 21 after 1.3 million steps, at a cost of 13.
     "safety_gym_expert": {
         "env_steps": 4_000_000,
         "num_envs": 32,
