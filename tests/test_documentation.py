@@ -46,6 +46,14 @@ def test_the_readme_is_short_and_leads_to_every_page() -> None:
     assert pages <= {target.partition("#")[0] for target in linked}
 
 
+def test_nothing_is_misspelt() -> None:
+    """Pages, docstrings, comments and messages. Tests are left out: some have wrong names on purpose."""
+    sources = [*PAGES, "Makefile", "pyproject.toml", "ccil_jax", "envs", "experiments"]
+    command = [sys.executable, "-m", "codespell_lib", "--skip=*.npz,*.json,*.csv,*.png,*.xml,*.pyc", *sources]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stdout + done.stderr
+
+
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     """Strictly: every page is in the navigation, every link and anchor exists, every name of the API is documented."""
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
