@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from envs.registry import TASKS
+
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
     path.relative_to(ROOT).as_posix()
@@ -44,6 +46,17 @@ def test_the_readme_is_short_and_leads_to_every_page() -> None:
         "docs/ablations_paper.md",
     }
     assert pages <= {target.partition("#")[0] for target in linked}
+
+
+def test_the_table_of_tasks_is_that_of_the_registry() -> None:
+    rows = re.findall(
+        r"^\| (\w+) \| (\d+): [^|]+ \| (\d+) \| [^|]+ \| [^|]+ \| (\d+) \|$",
+        (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
+    found = [(name, *map(int, numbers)) for name, *numbers in rows]
+    built_in = [task for task in TASKS.values() if task.original_package]  # other tests register tasks of their own
+    assert found == [(task.name, task.obs_dim, task.action_dim, task.cost_limit) for task in built_in]
 
 
 def test_nothing_is_misspelt() -> None:
