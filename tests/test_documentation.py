@@ -6,9 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
+from ccil_jax.agents import build
+from ccil_jax.agents.expert import expert_data
 from envs.registry import TASKS
+from tests.probe_envs import Walk, walk_config, walk_demonstrations
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted(
@@ -57,6 +61,20 @@ def test_the_table_of_tasks_is_that_of_the_registry() -> None:
     found = [(name, *map(int, numbers)) for name, *numbers in rows]
     built_in = [task for task in TASKS.values() if task.original_package]  # other tests register tasks of their own
     assert found == [(task.name, task.obs_dim, task.action_dim, task.cost_limit) for task in built_in]
+
+
+def test_every_metric_is_explained() -> None:
+    """The table has the columns that the methods report and no others."""
+    text = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8").partition("Every column")[2]
+    listed = {name for row in re.findall(r"^\| (`.*?) \| ", text, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
+    reported = {"iteration", "seed", "env_steps", "skipped_updates"}
+    for method in ("malm", "bc", "iq_learn"):
+        changes = {"cloning_updates": 100} if method == "bc" else {}
+        config = build.resolve(walk_config(method=method, **changes), Walk(), walk_demonstrations())
+        agent = build.make(config, Walk(), expert_data(walk_demonstrations()))
+        state = jax.eval_shape(agent.init, jax.random.key(0))
+        reported |= jax.eval_shape(agent.step, state)[1].keys()
+    assert listed == reported
 
 
 def test_nothing_is_misspelt() -> None:
