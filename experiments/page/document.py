@@ -95,8 +95,9 @@ def page(
         f"<title>{_text(title)}</title>",
         f"<style>{_STYLE}</style></head><body>",
         f"<h1>{_text(title)}</h1>",
-        f"<p class=note>{_NOTE}</p>",
     ]
+    if tasks:
+        parts.append(f"<p class=note>{_NOTE}</p>")
     if len(tasks) > 1:
         parts.append(_across_tasks(entries, seed))
     for task in tasks:
@@ -276,7 +277,10 @@ def policies_section(files: Sequence[PolicyFile], *, animated: bool = True) -> s
                 loaded = evaluating.load_file(file, task)
                 episodes.append(animation.play(loaded, index, f"policy-{i}-{index}", f"One episode of {label}."))
     titles = ["policy", "return", "cost", "limit", "steps of training"]
-    return "\n".join(["<h2>Policies</h2>", _table(titles, rows), *episodes])
+    note = (
+        "<p class=note>Means &plusmn; standard errors over the episodes that were played when a file was written.</p>"
+    )
+    return "\n".join(["<h2>Policies</h2>", note, _table(titles, rows), *episodes])
 
 
 def _of_episodes(values: np.ndarray | None) -> str:
