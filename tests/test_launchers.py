@@ -53,7 +53,7 @@ def test_help_shows_the_values_that_the_launcher_starts_from(launcher: ModuleTyp
     preset = re.search(r"hyperparameters to start from \(default: (\w+)\)", text)
     assert preset
     assert preset[1] == name
-    assert len({PRESETS[preset]["env_steps"] for preset in ("default", "expert")} | {Config().env_steps}) == 3
+    assert len({PRESETS[preset]["batch_size"] for preset in ("default", "expert")} | {Config().batch_size}) == 3
     assert f"rounded up to whole iterations (default: {PRESETS[name]['env_steps']}; static)" in text
     assert f"batch of its own (Table 1) (default: {PRESETS[name]['batch_size']}; static)" in text
 
@@ -197,7 +197,13 @@ def test_a_run_can_be_done_again_from_its_config_file(pipeline: Path, tmp_path: 
     seeds = train.make_plan(parser.parse_args(["--config", f"{pipeline}/malm/config.json", *out, "--num-seeds", "7"]))
     assert seeds.setup.num_seeds == 7
 
-    options = {"method": "malm", "env": "Swimmer", "demos": f"{pipeline}/expert.npz", "hidden_sizes": [5, 6]}
+    options: dict[str, Any] = {
+        "method": "malm",
+        "env": "Swimmer",
+        "demos": f"{pipeline}/expert.npz",
+        "hidden_sizes": [5, 6],
+    }
+    options |= {"max_episode_steps": 20}
     toml = "".join(f"{name} = {json.dumps(value)}\n" for name, value in options.items())
     for name, text in (("run.toml", toml), ("run.json", json.dumps(options))):
         (tmp_path / name).write_text(text)
@@ -210,11 +216,11 @@ def test_a_run_can_be_done_again_from_its_config_file(pipeline: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('metod = "malm"', "unrecognized arguments: --metod=malm"),
+        ('metod = "malm"', "--metod: unknown; did you mean --method?"),
         ('method = "malm"\nseed = -1', "--seed: -1"),
         ('method = "malm"\n[fixed]\nseed = 1', "fixed: a table; give the options of `train` side by side"),
         ("method = malm", "not TOML"),
-        ('out = "elsewhere"', "unrecognized arguments: --out=elsewhere"),
+        ('out = "elsewhere"', "--out: unknown"),
     ],
 )
 def test_a_wrong_config_file_is_named(tmp_path: Path, content: str, message: str) -> None:
