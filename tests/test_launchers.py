@@ -270,8 +270,9 @@ def test_any_seed_can_be_recorded(pipeline: Path, tmp_path: Path) -> None:
     summary = run_folder.read_json(pipeline / "malm" / "summary.json")
     arguments = evaluate.make_parser().parse_args([f"{pipeline}/malm", "--record", "new.npz", "--seed-index", "1"])
     trained = {**recording.training(stored, 240), "seed_indices": [0, 1]}
+    source: Any = SimpleNamespace(run=stored)
     loaded: Any = SimpleNamespace(training=trained, command=stored.facts["command"])
-    facts = evaluate.describe_recording(arguments, SimpleNamespace(run=stored), loaded, {})  # type: ignore[arg-type]
+    facts = evaluate.describe_recording(arguments, source, loaded, {})
     assert facts["seed_index"] == 1
     assert facts["evaluation"].pop("num_episodes") == summary["evaluation"]["num_episodes"]
     assert facts["evaluation"] == {name: summary["per_seed"][1][name] for name in facts["evaluation"]}

@@ -13,8 +13,14 @@ from experiments.page import document
 from experiments.policies import policy_file
 from experiments.policies.numpy_policy import policies
 
-TRAINING = {"task": "Swimmer", "method": "malm", "env_options": {}, "physics": "native", "cost_limit": 3.0}
-METADATA = {
+TRAINING: dict[str, Any] = {
+    "task": "Swimmer",
+    "method": "malm",
+    "env_options": {},
+    "physics": "native",
+    "cost_limit": 3.0,
+}
+METADATA: dict[str, Any] = {
     "activation": "tanh",
     "training": {**TRAINING, "seed_indices": [4, 7]},
     "levels": {"expert_return": 1.0, "expert_cost": 3.0},
@@ -99,7 +105,7 @@ def test_onnx_acts_as_the_policies_do(tmp_path: Path, squashed: bool, activation
 
 def without(*keys: str) -> dict[str, Any]:
     """The metadata without an entry of the training."""
-    return {**METADATA, "training": {k: v for k, v in METADATA["training"].items() if k not in keys}}  # type: ignore[attr-defined]
+    return {**METADATA, "training": {k: v for k, v in METADATA["training"].items() if k not in keys}}
 
 
 @pytest.mark.parametrize(
@@ -122,10 +128,11 @@ def without(*keys: str) -> dict[str, Any]:
         ({"metadata": {}}, "does not say how the policies were trained"),
         ({"metadata": without("physics")}, "no sound training.physics"),
         ({"metadata": without("seed_indices")}, "no sound training.seed_indices"),
-        ({"metadata": {**METADATA, "training": {**METADATA["training"], "seed_indices": [1]}}}, "do not make up"),  # type: ignore[dict-item]
-        ({"metadata": {**METADATA, "training": {**METADATA["training"], "cost_limit": "no"}}}, "training.cost_limit"),  # type: ignore[dict-item]
+        ({"metadata": {**METADATA, "training": {**METADATA["training"], "seed_indices": [1]}}}, "do not make up"),
+        ({"metadata": {**METADATA, "training": {**METADATA["training"], "cost_limit": "no"}}}, "training.cost_limit"),
         ({"metadata": {**METADATA, "activation": "eval"}}, "no known activation"),
         ({"metadata": {**METADATA, "levels": None}}, "no sound levels"),
+        ({"metadata": {**METADATA, "levels": {"expert_return": "high"}}}, "no sound levels"),
     ],
 )
 def test_what_is_no_policy_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -153,7 +160,7 @@ def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
         "episode_cost": np.array([[2.0, 4.0], [5.0, 5.0]]),
     }
     npz.write(tmp_path / "a.npz", content(**episodes))
-    npz.write(tmp_path / "b.npz", content(metadata={**METADATA, "training": {**METADATA["training"], "task": "a:b"}}))  # type: ignore[dict-item]
+    npz.write(tmp_path / "b.npz", content(metadata={**METADATA, "training": {**METADATA["training"], "task": "a:b"}}))
     files = [policy_file.read(tmp_path / name) for name in ("a.npz", "b.npz")]
     page = document.page([], {}, policies=document.policies_section(files))
     assert "<td>malm on Swimmer, seed 4</td><td>3.00 <small>&plusmn; 1.00</small></td>" in page

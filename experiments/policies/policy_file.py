@@ -170,5 +170,6 @@ def _check_metadata(path: Path, metadata: dict[str, Any]) -> None:
         raise ArchiveError(f"{path}: 'metadata' has no sound training.cost_limit; {_AGAIN}")
     if metadata.get("activation") not in CHOICES["activation"]:
         raise ArchiveError(f"{path}: 'metadata' has no known activation; {_AGAIN}")
-    if not isinstance(metadata.get("levels"), dict):
+    levels = metadata.get("levels")
+    if not (isinstance(levels, dict) and all(x is None or type(x) in (int, float) for x in levels.values())):
         raise ArchiveError(f"{path}: 'metadata' has no sound levels of an expert; {_AGAIN}")
