@@ -14,6 +14,7 @@ from ccil_jax.methods import METHODS, find_method
 from envs.registry import TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import demonstration_files
 
 _EVALUATION_SEED_OFFSET = 10_000_019  # so that evaluation draws other random numbers than training with the same --seed
 
@@ -98,7 +99,11 @@ def add_options(parser: Parser, *, with_method: bool = True) -> None:
         parser.add_argument("--method", default=absent, metavar="NAME", help=text)
     options.add_run_options(parser)
     parser.add_argument(
-        "--demos", default=absent, type=Path, metavar="FILE", help="demonstrations (default: those shipped for --env)"
+        "--demos",
+        default=absent,
+        type=demonstration_files.to_read,
+        metavar="FILE",
+        help=f"demonstrations: {demonstration_files.TO_READ} (default: those shipped for --env)",
     )
     parser.add_argument(
         "--num-demos", default=absent, type=command_line.positive, metavar="K", help="use the first K trajectories only"

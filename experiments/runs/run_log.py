@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ccil_jax.config import Config
-from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.filesystem import content_sha256
 from experiments.cli import options
 from experiments.runs import run_folder, summary
 from experiments.runs.metrics_file import MetricsWriter
@@ -69,7 +69,7 @@ def _facts(plan: RunPlan, env: Any) -> dict[str, Any]:
     if setup.demonstrations_path is not None:
         demonstrations = {
             "file": str(setup.demonstrations_path.resolve()),
-            "sha256": file_sha256(setup.demonstrations_path),
+            "sha256": content_sha256(setup.demonstrations_path),
             "num_episodes": setup.num_demonstrations,
         }
     device = jax.devices()[0]
