@@ -18,6 +18,7 @@ from experiments.runs import wandb_log
 from experiments.runs.metrics_file import MetricsWriter, read_metrics
 from experiments.runs.run_log import _writers_of
 from experiments.runs.wandb_log import WandbWriter
+from experiments.sweeps import variants
 
 METRICS = {
     "env_steps": np.array([[40, 40], [80, 80]]),
@@ -108,3 +109,5 @@ def test_a_run_has_a_project_only_if_it_is_given_one(tmp_path: Path) -> None:
             writer.__exit__(None, None, None)
     assert kinds == [[MetricsWriter], [MetricsWriter, WandbWriter]]
     assert plans[0].setup == plans[1].setup  # they may share a program
+    fields = {"method": "bc", "env": "Swimmer", "wandb": "p"}
+    assert variants.make_variant("x", fields, tmp_path / "sweep").plan.wandb == "p"

@@ -194,8 +194,8 @@ def _check_complete(checked: Demonstrations, source: str) -> None:
     if checked.final_obs is None:
         raise DemonstrationsError(
             f"{source}: needs the observation after each episode's last step, which these demonstrations do not have "
-            "('final_obs'); record them again with this version's `evaluate RUN_DIR --record` (or --policy), or write "
-            ".npz"
+            "('final_obs'); record them again with `evaluate RUN_DIR --record FILE` or "
+            "`evaluate --policy TASK --record FILE`, or write .npz"
         )
 
 

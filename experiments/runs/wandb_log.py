@@ -68,7 +68,7 @@ class WandbWriter:
     @property
     def place(self) -> str:
         """Where the run can be seen: an address, or the command that sends it."""
-        return self._run.url or f"wandb sync {self._run.settings.sync_dir}"
+        return f"wandb sync {self._run.settings.sync_dir}" if self._run.offline else str(self._run.url or "off")
 
     def begin(self, history: Mapping[str, np.ndarray]) -> None:
         """Logs the metrics `[iterations, num_seeds]` of a checkpoint; {} for a new run."""
