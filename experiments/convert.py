@@ -1,7 +1,9 @@
-"""Converts demonstrations of another format to ours: `.npz` of baselines and CCIL, HDF5 of DSRL, a folder of Minari.
+"""Converts demonstrations between formats: from baselines, CCIL, DSRL, Minari and ours to ours, DSRL's or Minari's.
 
-The format is recognised by the content of the file, or is one of your own, `--format`. The file is not trusted: no code
-in it is run, and one that is damaged, inconsistent or of another task is refused with a one-line message.
+What is read is recognised by its content, or is of a format of your own, `--format`. It is not trusted: no code in it
+is run, and a file that is damaged, inconsistent or of another task is refused with a one-line message. What is written
+follows from the name of --out. DSRL's and Minari's datasets have the observation after each episode's last step, which
+files of earlier versions lack.
 """
 
 import argparse
@@ -15,12 +17,18 @@ from ccil_jax.demonstrations.trajectories import Demonstrations, check_matches, 
 from ccil_jax.errors import UserError
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import demonstration_files
 
 
 def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("convert", __doc__ or "")
-    parser.add_argument("file", type=Path, metavar="FILE", help="demonstrations, or the folder of a Minari dataset")
+    parser.add_argument(
+        "file",
+        type=demonstration_files.to_read,
+        metavar="FILE",
+        help=f"demonstrations: {demonstration_files.TO_READ}",
+    )
     parser.add_argument(
         "--env", metavar="TASK", help="task of the demonstrations, whose dimensions must be those of the task"
     )
@@ -30,8 +38,14 @@ def make_parser() -> Parser:
         help="read it as your own ccil_jax.Format, found as NAME in the Python module MODULE "
         "(default: recognise the format)",
     )
-    parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz", help="demonstrations file to write")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing --out file")
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help=f"what to write: {demonstration_files.TO_WRITE}",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace what --out names")
     parser.add_argument(
         "--default-cost",
         type=float,
@@ -45,9 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Checks everything, converts the file and prints what was written."""
     task = options.find_task(arguments.env)
     out: Path = arguments.out
-    if out.suffix != ".npz":
-        raise UsageError(f"--out {out}: a demonstrations file is named *.npz")
-    command_line.check_new_file(out, "--out", overwrite=arguments.overwrite)
+    demonstration_files.check_new(out, "--out", overwrite=arguments.overwrite)
     if arguments.default_cost is not None and not 0 <= arguments.default_cost < float("inf"):
         raise UsageError(f"--default-cost {arguments.default_cost}: must be finite and not negative")
     try:
@@ -60,8 +72,10 @@ def run(arguments: argparse.Namespace) -> None:
             f"--default-cost {arguments.default_cost:g}: {arguments.file} has costs of its own; leave it out"
         )
     check_matches(demonstrations, arguments.file, task)
-    command_line.check_writable(out.parent, "--out")
-    facts = {"task": task.name, "source": arguments.file.name, "command": command_line.command()}
+    demonstration_files.check_writable(out, "--out")
+    earlier = demonstrations.metadata.get("command")  # those that made the demonstrations, one a line
+    made_by = f"{earlier}\n{command_line.command()}" if isinstance(earlier, str) else command_line.command()
+    facts = {"task": task.name, "source": arguments.file.name, "command": made_by}
     try:
         save_demonstrations(out, dataclasses.replace(demonstrations, metadata={**demonstrations.metadata, **facts}))
     except OSError as error:

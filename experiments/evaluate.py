@@ -23,7 +23,7 @@ from experiments.cli.command_line import Parser, UsageError
 from experiments.policies import evaluating, policy_file
 from experiments.policies.evaluating import Loaded, Settings
 from experiments.policies.numpy_policy import is_known
-from experiments.runs import evaluations, recording, run_folder, summary
+from experiments.runs import demonstration_files, evaluations, recording, run_folder, summary
 from experiments.runs.run_folder import Run
 
 _NUM_TRAJECTORIES = 10  # to record, unless said otherwise
@@ -78,8 +78,9 @@ def _add_files(parser: Parser) -> None:
     parser.add_argument(
         "--record",
         type=Path,
-        metavar="FILE.npz",
-        help="also record demonstrations by the policy of one seed, in our simulator and with sampled actions",
+        metavar="FILE",
+        help="also record demonstrations by the policy of one seed, in our simulator and with sampled actions, as "
+        f"{demonstration_files.TO_WRITE}",
     )
     parser.add_argument(
         "--seed-index",
@@ -117,7 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
     files = check_files(arguments, path)
     check_recording(arguments, source)
     for option, file in files:
-        command_line.check_writable(file.parent, option)
+        demonstration_files.check_writable(file, option)
     xla.spread_seeds(len(source.seeds))
     loaded, settings = source.load(), _settings(arguments)
     episodes = evaluating.play(loaded, settings)
@@ -214,8 +215,6 @@ def check_files(arguments: argparse.Namespace, path: Path | None) -> list[tuple[
             raise UsageError(f"--export {file}: unknown kind of file; end its name with .npz, .onnx or .stablehlo")
         if file.suffix == ".onnx" and importlib.util.find_spec("onnx") is None:
             raise UsageError(f"--export {file}: needs the package onnx; `pip install 'ccil_jax[onnx]'`")
-    if arguments.record and arguments.record.suffix != ".npz":
-        raise UsageError(f"--record {arguments.record}: a demonstrations file is named *.npz")
     written = [("--export", file) for file in arguments.export]
     written += [("--record", arguments.record)] if arguments.record else []
     if arguments.overwrite and not written:
@@ -226,7 +225,8 @@ def check_files(arguments: argparse.Namespace, path: Path | None) -> list[tuple[
         if file.resolve() in taken:
             raise UsageError(f"{option} {file}: two results would go into this file; give each a name of its own")
         taken.add(file.resolve())
-        command_line.check_new_file(file, option, overwrite=arguments.overwrite)
+        check = demonstration_files.check_new if option == "--record" else command_line.check_new_file
+        check(file, option, overwrite=arguments.overwrite)
     return [*results, *written]
 
 

@@ -21,7 +21,7 @@ from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
 from experiments.policies import evaluating
 from experiments.policies.evaluating import Loaded, Settings
-from experiments.runs import recording, run_folder
+from experiments.runs import recording, run_folder, wandb_log
 from experiments.runs.execution import execute
 from experiments.runs.plans import RunPlan, Setup, make_setup
 from experiments.runs.recording import choose_seed
@@ -89,6 +89,8 @@ def make_plan(arguments: argparse.Namespace) -> RunPlan:
     preset = {**saved, **given}.get("preset", task.expert_preset)
     config = options.config_from({**given, **limit}, preset, saved)
     env_options = options.env_options(choices, task)
+    if choices["wandb"]:
+        wandb_log.check(choices["wandb"])
     for option, file in written.items():
         command_line.check_writable(file.parent, option)
     folder = arguments.run_dir or command_line.default_folder(task.name, method, "--run-dir")
@@ -100,6 +102,7 @@ def make_plan(arguments: argparse.Namespace) -> RunPlan:
         folder=folder,
         resume=arguments.resume,
         command=command_line.command(),
+        wandb=choices["wandb"],
     )
 
 

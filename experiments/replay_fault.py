@@ -11,10 +11,10 @@ from typing import Any
 
 from ccil_jax.demonstrations.npz import ArchiveError
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
-from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.filesystem import content_sha256
 from experiments.cli import command_line
 from experiments.cli.command_line import Parser, UsageError
-from experiments.runs import fault_files, run_folder
+from experiments.runs import demonstration_files, fault_files, run_folder
 from experiments.runs.environments import build_environment
 
 
@@ -22,7 +22,12 @@ def make_parser() -> Parser:
     """The options of this launcher."""
     parser = Parser("replay_fault", __doc__ or "")
     parser.add_argument("file", type=Path, metavar="FILE", help="fault_seed_N.npz of a run folder")
-    parser.add_argument("--demos", type=Path, metavar="FILE", help="the demonstrations of the run, if they were moved")
+    parser.add_argument(
+        "--demos",
+        type=demonstration_files.to_read,
+        metavar="FILE",
+        help="the demonstrations of the run, if they were moved",
+    )
     return parser
 
 
@@ -66,7 +71,7 @@ def _demonstrations(facts: dict[str, Any] | None, path: Path | None) -> Demonstr
     if facts is None:
         return None
     path = path or Path(facts["file"])
-    if not path.is_file() or file_sha256(path) != facts["sha256"]:
+    if content_sha256(path) != facts["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run began with; give that file")
     return load_demonstrations(path).take_episodes(facts["num_episodes"])
 

@@ -51,7 +51,7 @@ def demonstrations(obs_dim: int = 8, action_dim: int = 2, **metadata: Any) -> De
 def raw(path: Path, **changes: Any) -> None:
     """A demonstrations file with some keys replaced, written past our own checks."""
     good = demonstrations()
-    arrays = {f.name: getattr(good, f.name) for f in dataclasses.fields(good)}
+    arrays = {f.name: value for f in dataclasses.fields(good) if (value := getattr(good, f.name)) is not None}
     arrays["metadata"] = np.array(json.dumps(good.metadata))
     np.savez(path, allow_pickle=True, **{**arrays, **changes})
 
@@ -171,8 +171,8 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "--record old.npz: is a folder",
     ),
     "record to other format": (
-        ("evaluate", "done", "--record", "new.h5"),
-        "--record new.h5: a demonstrations file is named *.npz",
+        ("evaluate", "done", "--record", "new.csv"),
+        "--record new.csv: a demonstrations file is named *.npz",
     ),
     "record twice": (
         (*RECORD, "--export", "./new.npz", "--seed-index", "0"),

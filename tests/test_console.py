@@ -47,7 +47,7 @@ def script(tmp_path: Path) -> Path:
 
 
 def test_the_overview_lists_every_launcher(capsys: pytest.CaptureFixture[str]) -> None:
-    known = "ablations benchmark convert evaluate expert growth replay_fault report sweep theorem1 train"
+    known = "ablations benchmark completion convert evaluate expert growth replay_fault report sweep theorem1 train"
     assert [*console.launchers()] == known.split()
     for arguments in ([], ["--help"], ["-h"]):
         assert console.main(arguments) == 0

@@ -29,6 +29,9 @@ class Task:
     action_dim: int = 2
 
 
+FINAL_OBS = -np.arange(24, dtype=np.float32).reshape(3, 8)
+
+
 def make(**changes: Any) -> Demonstrations:
     """Three episodes of 2, 3 and 1 steps."""
     fields: dict[str, Any] = {
@@ -39,6 +42,7 @@ def make(**changes: Any) -> Demonstrations:
         "terminated": np.array([0, 1, 0, 0, 0, 0], bool),
         "truncated": np.array([0, 0, 0, 0, 1, 1], bool),
         "episode_ends": np.array([2, 5, 6]),
+        "final_obs": FINAL_OBS,
         "metadata": {"task": "Swimmer", "method": "expert"},
     }
     return Demonstrations(**{**fields, **changes})
@@ -77,11 +81,18 @@ def test_without_rewards_there_are_no_returns(tmp_path: Path) -> None:
     assert loaded.take_episodes(1).rewards is None
 
 
+def test_files_of_earlier_versions_lack_the_last_observations(tmp_path: Path) -> None:
+    loaded = load_demonstrations(write(tmp_path / "d.npz", remove="final_obs"))
+    assert loaded.final_obs is None
+    assert loaded.take_episodes(1).final_obs is None
+
+
 def test_take_episodes_keeps_the_first_whole_ones() -> None:
     taken = make().take_episodes(2)
     np.testing.assert_array_equal(taken.episode_ends, [2, 5])
     np.testing.assert_array_equal(taken.obs, make().obs[:5])
     np.testing.assert_array_equal(taken.episode_costs, [1, 2])
+    np.testing.assert_array_equal(taken.final_obs, FINAL_OBS[:2])
     for count in (0, 4):
         with pytest.raises(DemonstrationsError, match="between 1 and 3"):
             make().take_episodes(count)
@@ -125,7 +136,7 @@ def test_saving_refuses_what_loading_would_refuse(tmp_path: Path) -> None:
         with pytest.raises(DemonstrationsError, match=r"d\.npz: '(costs|metadata)'"):
             save_demonstrations(tmp_path / "d.npz", make(**changes))
     with pytest.raises(DemonstrationsError, match=r"named \*\.npz"):
-        save_demonstrations(tmp_path / "d.h5", make())
+        save_demonstrations(tmp_path / "d.csv", make())
 
 
 def nan_at(array: np.ndarray, row: int, value: float = np.nan) -> np.ndarray:
@@ -176,6 +187,11 @@ BAD_ARRAYS: dict[str, tuple[dict[str, Any], str]] = {
     "inf": ({"actions": nan_at(make().actions, 5, np.inf)}, r"'actions' holds NaN.*trajectory 2, row 5"),
     "too large for float32": ({"costs": np.full(6, 1e300)}, "'costs' holds NaN or infinity"),
     "nan reward": ({"rewards": np.full(6, np.nan)}, r"'rewards' holds NaN.*row 0"),
+    "final observations": (
+        {"final_obs": np.zeros((2, 8))},
+        r"'final_obs' has shape \(2, 8\), must have shape \(3, 8\)",
+    ),
+    "nan at last": ({"final_obs": nan_at(FINAL_OBS, 1)}, r"'final_obs' holds NaN.*trajectory 1, row 1"),
     "negative cost": ({"costs": nan_at(make().costs, 2, -1)}, r"'costs' is negative.*trajectory 1, row 2"),
     "done inside": ({"terminated": np.ones(6, bool)}, r"'terminated' is true before.*trajectory 0, row 0"),
     "metadata not json": ({"metadata": np.array("{")}, "'metadata' is not a JSON object"),

@@ -51,6 +51,17 @@ def test_seeds_with_the_same_draw_play_the_same_episodes(three: Evaluation) -> N
         np.testing.assert_allclose(rows[0], getattr(three, name)[0], rtol=1e-5)
 
 
+def test_a_recording_ends_with_the_observation_after_the_last_step() -> None:
+    """The task's position is its reward, and its second number changes its sign in every step."""
+    one = jax.tree.map(lambda leaf: leaf[0], actor(1))
+    found = evaluation.record(CONFIG, one, Walk(), num_episodes=64, seed=3)
+    last = found.episode_ends - 1
+    assert found.terminated[last].any()
+    assert found.truncated[last].any()
+    rewards = np.asarray(found.rewards)
+    np.testing.assert_array_equal(found.final_obs, np.stack([rewards[last], -found.obs[last, 1]], axis=1))
+
+
 def test_the_random_policys_episodes_do_not_depend_on_how_they_are_shared(monkeypatch: pytest.MonkeyPatch) -> None:
     """On 1 device and, as far as the padding goes, on 3; an episode's draws follow from its number alone."""
     few, many = (evaluation.random_policy(Walk(), num_episodes=count, seed=5) for count in (4, 7))

@@ -428,7 +428,7 @@ def test_the_converter_answers_wrong_use_in_one_line(tmp_path: Path, capsys: pyt
         ((path, "--env", "Ant", *out), "'obs' has 8 columns, Ant has obs_dim 27"),
         ((path, *out), "--env: required"),
         ((path, "--env", "Swimmer", "--out", path), "exists"),
-        ((path, "--env", "Swimmer", "--out", "x.h5"), "named *.npz"),
+        ((path, "--env", "Swimmer", "--out", "x.csv"), "named *.npz"),
         ((path, "--env", "Swimmer", *out, "--default-cost", "nan"), "--default-cost nan"),
         ((path, "--env", "Swimmer", *out, "--default-cost", "0"), "expert.npz has costs of its own; leave it out"),
     ):

@@ -37,6 +37,7 @@ class Trajectories:
     """N episodes side by side, T the time limit. Steps after the end of an episode are there too, but not `valid`."""
 
     obs: jax.Array  # [T, N, obs_dim]
+    next_obs: jax.Array  # [T, N, obs_dim] the observation after the step
     action: jax.Array  # [T, N, action_dim] as executed: clipped to the environment's range
     reward: jax.Array  # [T, N]
     cost: jax.Array  # [T, N]
@@ -66,6 +67,7 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
         check_step(env, stepped, num_episodes)
         steps = Trajectories(
             obs=state.obs,
+            next_obs=stepped.obs,
             action=action,
             reward=stepped.reward,
             cost=stepped.cost,
@@ -222,6 +224,7 @@ def record(
 
     steps = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
     keep = steps.valid.T  # [N, T]: one episode after the other
+    lengths = keep.sum(axis=1)
 
     def flat(x: np.ndarray) -> np.ndarray:
         return np.swapaxes(x, 0, 1)[keep]
@@ -233,6 +236,7 @@ def record(
         costs=flat(steps.cost).astype(np.float32),
         terminated=flat(steps.terminated),
         truncated=flat(steps.truncated),
-        episode_ends=np.cumsum(keep.sum(axis=1)),
+        episode_ends=np.cumsum(lengths),
+        final_obs=steps.next_obs[lengths - 1, np.arange(num_episodes)].astype(np.float32),
         metadata=metadata or {},
     )

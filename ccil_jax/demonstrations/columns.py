@@ -84,7 +84,9 @@ FORMS: Mapping[str, Callable[[np.ndarray, str], np.ndarray]] = {  # the form of 
     "terminated": flags,
     "truncated": flags,
     "episode_ends": indices,
+    "final_obs": rows,
 }
+OPTIONAL = frozenset({"rewards", "final_obs"})  # those that demonstrations may lack
 
 
 def joined(parts: Sequence[np.ndarray], where: Callable[[int], str]) -> np.ndarray:

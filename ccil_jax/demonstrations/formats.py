@@ -1,4 +1,4 @@
-"""The table of the formats that demonstrations can be read from. Formats from outside can be added to it.
+"""The table of the formats that demonstrations can be read from and written to. Formats to read can be added to it.
 
 | Format | Content | An episode ends |
 |---|---|---|
@@ -7,20 +7,22 @@
 | Minari | a folder with `data/main_data.hdf5`, one group `episode_N` each; cost in `infos/cost` | with its group |
 | our own | `.npz`, see `own` | where `episode_ends` says so |
 
-Formats are recognised by content, not by name. Nothing in a file is trusted: the readers of this table run no code from
-it and bound how much they read, and `load_demonstrations` checks all values that a reader returns.
+What is read is recognised by its content, and what is written by its name. Nothing in a file is trusted: the readers of
+this table run no code from it and bound how much they read, and `load_demonstrations` checks all values that a reader
+returns.
 """
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ccil_jax.demonstrations import baselines, columns, dsrl, hdf5, minari, npz, own
+from ccil_jax.demonstrations import baselines, columns, dsrl, hdf5, minari, minari_datasets, npz, own
 from ccil_jax.errors import DemonstrationsError, UserError
 from envs.lookup import named_object
 
-_OPTIONAL = frozenset({"rewards", "costs", "metadata"})
+_OPTIONAL = columns.OPTIONAL | {"costs", "metadata"}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -28,8 +30,9 @@ class Format:
     """A format of demonstrations: how a file or folder of it is recognised, and how it is read.
 
     `read` returns a mapping with the arrays of `Demonstrations` by name: `obs`, `actions`, `terminated`, `truncated`
-    and `episode_ends`, and where the file has them `rewards`, `costs` and `metadata` (a JSON object). Episodes lie one
-    after the other. Arrays may have other types of numbers than `Demonstrations`, and [N, 1] in the place of [N].
+    and `episode_ends`, and where the file has them `rewards`, `costs`, `final_obs` and `metadata` (a JSON object).
+    Episodes lie one after the other. Arrays may have other types of numbers than `Demonstrations`, and [N, 1] in the
+    place of [N].
     """
 
     name: str
@@ -103,7 +106,7 @@ def format_of(path: Path) -> Format:
 
 
 def read(path: Path, file_format: Format) -> dict[str, Any]:
-    """What the reader of `file_format` returns, with None for `rewards` and `costs` that are not there.
+    """What the reader of `file_format` returns, with None for arrays that may be missing and are.
 
     The values are not checked yet.
 
@@ -129,7 +132,7 @@ def read(path: Path, file_format: Format) -> dict[str, Any]:
             f"{path}: the reader of format {file_format.name} returned metadata of type {type(metadata).__name__}; "
             "they must be a dict"
         )
-    return {"rewards": None, "costs": None, **arrays, "metadata": dict(metadata)}
+    return {**dict.fromkeys(_OPTIONAL), **arrays, "metadata": dict(metadata)}
 
 
 def _call(file_format: Format, function: Callable[[Path], Any], path: Path) -> Any:
@@ -144,3 +147,28 @@ def _call(file_format: Format, function: Callable[[Path], Any], path: Path) -> A
             f"{path}: format {file_format.name} failed with {type(error).__name__}: {reason}; check the file, or the "
             "functions of the format"
         ) from error
+
+
+Writer = Callable[[Path, Mapping[str, Any], Mapping[str, Any]], None]  # path, arrays of `Demonstrations`, metadata
+
+
+def writer_of(path: str | os.PathLike[str]) -> Writer:
+    """What writes demonstrations of the name `path`: `*.npz` (ours), `*.hdf5` or `*.h5` (DSRL's), `minari:ID`.
+
+    Raises:
+        DemonstrationsError: the name is none of these, or the library that the format needs is missing.
+    """
+    suffix = Path(path).suffix
+    if suffix == ".npz":
+        return own.write
+    if minari_datasets.is_name(path):
+        minari_datasets.folder_of(path)
+        hdf5.check_can_write(path)
+        return minari_datasets.write
+    if suffix in dsrl.SUFFIXES:
+        hdf5.check_can_write(path)
+        return dsrl.write
+    raise DemonstrationsError(
+        f"{os.fspath(path)}: a demonstrations file is named *.npz, or *.hdf5 for DSRL's layout; minari:ID makes a "
+        "dataset of Minari"
+    )

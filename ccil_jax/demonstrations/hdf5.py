@@ -13,6 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ccil_jax.demonstrations import hdf5_child, npz
+from ccil_jax.errors import DemonstrationsError
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 TIMEOUT = 300.0  # seconds that the child process may take
@@ -40,6 +41,14 @@ def read(path: Path) -> dict[str, np.ndarray]:
         if status != 0:
             raise npz.ArchiveError(f"{path}: damaged HDF5 file, its reader ended with status {status}; copy it again")
         return npz.read_open(file, str(path), sorted(npz.keys_of(file)), remedy="copy the file again")
+
+
+def check_can_write(path: str | os.PathLike[str]) -> None:
+    """Raises `DemonstrationsError` where the library that writes HDF5 is missing."""
+    if importlib.util.find_spec("h5py") is None:
+        raise DemonstrationsError(
+            f"{os.fspath(path)}: writing HDF5 needs h5py; install it with `pip install 'ccil_jax[hdf5]'`"
+        )
 
 
 def _nameless_file(path: Path) -> tuple[BinaryIO, str, str]:

@@ -21,7 +21,7 @@ COST_KEYS = ("infos/cost", "infos/costs", "costs")  # where an episode of Minari
 CPU_SECONDS = 120
 MAX_ENTRIES = 100_000
 _NAME = re.compile(
-    r"(episode_\d{1,9}/)?(observations|actions|rewards|costs|terminals|timeouts|terminations|truncations|infos/costs?)"
+    r"(episode_\d{1,9}/)?(observations|next_observations|actions|rewards|costs|terminals|timeouts|terminations|truncations|infos/costs?)"
 )
 _FILTERS = {1, 2, 3, 32000}  # those that h5py has built in: deflate, shuffle, Fletcher's checksum, LZF
 

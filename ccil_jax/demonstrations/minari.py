@@ -75,7 +75,7 @@ def arrays_of(found: Mapping[str, np.ndarray], path: Path) -> dict[str, Any]:
             raise ArchiveError(f"{path}: '{without[0]}' has no {key}, other episodes have; record it again")
         return None if without else columns.joined(parts, lambda i: f"{path}: '{key}' of trajectory {i}")
 
-    keys = ("obs", "actions", "rewards", "costs", "terminated", "truncated")
+    keys = ("obs", "actions", "rewards", "costs", "terminated", "truncated", "final_obs")
     ends = np.cumsum([len(episode["actions"]) for episode in episodes])
     return {**{key: joined(key) for key in keys}, "episode_ends": ends, "metadata": {"format": "minari"}}
 
@@ -93,9 +93,11 @@ def _episode(found: Mapping[str, np.ndarray], name: str, path: Path) -> dict[str
     length = len(actions)
     if length == 0:
         raise ArchiveError(f"{where('actions')} has no rows: an episode without steps; remove that episode")
+    obs = columns.rows(found[f"{name}/observations"], where("observations"), length + 1)
     rewards = found.get(f"{name}/rewards")
     return {
-        "obs": columns.rows(found[f"{name}/observations"], where("observations"), length + 1)[:-1],
+        "obs": obs[:-1],
+        "final_obs": obs[-1:],
         "actions": actions,
         "rewards": None if rewards is None else columns.per_step(rewards, where("rewards"), (length,)),
         "costs": _episode_costs(found, name, length, path),

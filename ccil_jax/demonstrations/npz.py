@@ -15,7 +15,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -146,12 +146,19 @@ def json_object(array: np.ndarray, where: str, remedy: str) -> dict[str, Any]:
 
 def write(path: Path, arrays: Mapping[str, Any]) -> None:
     """Writes a compressed archive, whole or not at all. Equal arrays give equal bytes. Raises `OSError`."""
+    with whole(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """An empty file beside `path` to write to. It takes the place of `path` at the end, or goes where writing fails."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}.", suffix=".tmp")
+    os.close(handle)
     temporary = Path(name)
     try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        yield temporary
         temporary.chmod(0o644)  # mkstemp's 0600 would hide a shared file from its readers
         temporary.replace(path)
     except BaseException:

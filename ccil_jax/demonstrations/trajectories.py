@@ -13,12 +13,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ccil_jax.demonstrations import columns, formats, npz
+from ccil_jax.demonstrations import columns, formats, minari_datasets, npz, own
 from ccil_jax.demonstrations.formats import Format
 from ccil_jax.errors import DemonstrationsError
 
 _NUMBER_KEYS = ("obs", "actions", "rewards", "costs")
 _STEP_KEYS = (*_NUMBER_KEYS, "terminated", "truncated")
+_FLOAT_KEYS = (*_NUMBER_KEYS, "final_obs")
 
 
 class TaskInfo(Protocol):
@@ -48,6 +49,9 @@ class Demonstrations:
     terminated: np.ndarray  # [n] bool: the task ended after this step
     truncated: np.ndarray  # [n] bool: the time limit was reached after this step
     episode_ends: np.ndarray  # [E] int64: one more than the index of each episode's last step
+    final_obs: np.ndarray | None = (
+        None  # [E, obs_dim] float32: the observation after each episode's last step, if known
+    )
     metadata: dict[str, Any] = dataclasses.field(default_factory=dict)  # for example task, method, versions, command
 
     @property
@@ -108,7 +112,12 @@ class Demonstrations:
             raise DemonstrationsError(f"{count} trajectories asked for; choose between 1 and {self.num_episodes}")
         end = int(self.episode_ends[count - 1])
         steps: dict[str, Any] = {key: None if (v := getattr(self, key)) is None else v[:end] for key in _STEP_KEYS}
-        return Demonstrations(**steps, episode_ends=self.episode_ends[:count], metadata=dict(self.metadata))
+        return Demonstrations(
+            **steps,
+            episode_ends=self.episode_ends[:count],
+            final_obs=None if self.final_obs is None else self.final_obs[:count],
+            metadata=dict(self.metadata),
+        )
 
     def _episode_sums(self, values: np.ndarray) -> np.ndarray:
         starts = np.concatenate([[0], self.episode_ends[:-1]])
@@ -129,7 +138,7 @@ def load_demonstrations(
     whichever reader it comes from.
 
     Args:
-        path: a file, or the folder of a dataset.
+        path: a file, the folder of a dataset, or `minari:ID`, a dataset among the local ones of Minari.
         default_cost: taken as the cost of every step where the file has no costs; the metadata say so then. Without
             it, such a file is refused.
         file_format: read the file as one of this format, whether it is recognised and registered or not.
@@ -137,7 +146,7 @@ def load_demonstrations(
     Raises:
         DemonstrationsError: this is no sound file. The message is one line with file, key and remedy.
     """
-    path = Path(path)
+    path = minari_datasets.locate(path)
     chosen = formats.format_of(path) if file_format is None else file_format
     arrays = formats.read(path, chosen)
     if arrays["costs"] is None:
@@ -154,24 +163,40 @@ def load_demonstrations(
 
 
 def save_demonstrations(path: str | os.PathLike[str], demonstrations: Demonstrations) -> None:
-    """Checks the demonstrations and writes them to a compressed `.npz`, whole or not at all.
+    """Checks the demonstrations and writes them, whole or not at all. What is there under that name is replaced.
 
-    Equal demonstrations give equal bytes.
+    Args:
+        path: `NAME.npz` for a compressed file of our own format, of which equal demonstrations give equal bytes;
+            `NAME.hdf5` or `NAME.h5` for a file with DSRL's datasets; `minari:ID` for a dataset among the local ones of
+            Minari. The last two need the rewards and the observation after each episode's last step.
+        demonstrations: what to write.
 
     Raises:
-        DemonstrationsError: `load_demonstrations` would refuse the file.
+        DemonstrationsError: the name is none of these, the format's library is missing, arrays are missing, or
+            `load_demonstrations` would refuse the demonstrations.
         OSError: the disk is full or cannot be written to.
     """
     path = Path(path)
-    if path.suffix != ".npz":
-        raise DemonstrationsError(f"{path}: a demonstrations file is named *.npz")
+    write = formats.writer_of(path)
     checked = _checked({f.name: getattr(demonstrations, f.name) for f in dataclasses.fields(Demonstrations)}, str(path))
-    arrays = {key: value for key in columns.FORMS if (value := getattr(checked, key)) is not None}
+    if write is not own.write:
+        _check_complete(checked, str(path))
     try:
-        text = json.dumps(checked.metadata, sort_keys=True, allow_nan=False)
+        json.dumps(checked.metadata, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise DemonstrationsError(f"{path}: 'metadata' is not JSON ({error}); use plain numbers and text") from None
-    npz.write(path, {**arrays, "metadata": np.array(text)})
+    write(path, {key: getattr(checked, key) for key in columns.FORMS}, checked.metadata)
+
+
+def _check_complete(checked: Demonstrations, source: str) -> None:
+    if checked.rewards is None:
+        raise DemonstrationsError(f"{source}: needs rewards, which these demonstrations do not have; write .npz")
+    if checked.final_obs is None:
+        raise DemonstrationsError(
+            f"{source}: needs the observation after each episode's last step, which these demonstrations do not have "
+            "('final_obs'); record them again with `evaluate RUN_DIR --record FILE` or "
+            "`evaluate --policy TASK --record FILE`, or write .npz"
+        )
 
 
 def check_matches(demonstrations: Demonstrations, path: str | os.PathLike[str], task: TaskInfo) -> None:
@@ -212,7 +237,7 @@ def check_time_limit(demonstrations: Demonstrations, source: str | os.PathLike[s
 
 def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
     """Demonstrations of these arrays, converted to their final types and checked; `source` begins every message."""
-    known = [key for key in columns.FORMS if key != "rewards" or arrays[key] is not None]
+    known = [key for key in columns.FORMS if key not in columns.OPTIONAL or arrays[key] is not None]
     converted: dict[str, Any] = {key: _convert(arrays[key], key, source) for key in known}
     num_steps = len(converted["obs"])
     if num_steps == 0:
@@ -223,7 +248,8 @@ def _checked(arrays: Mapping[str, Any], source: str) -> Demonstrations:
                 f"{source}: '{key}' has {len(converted[key])} rows, 'obs' has {num_steps}; they must be equal"
             )
     _check_episode_ends(converted["episode_ends"], num_steps, source)
-    checked = Demonstrations(**{"rewards": None, **converted}, metadata=dict(arrays["metadata"]))
+    _check_final_obs(converted, source)
+    checked = Demonstrations(**{**dict.fromkeys(columns.OPTIONAL), **converted}, metadata=dict(arrays["metadata"]))
     _check_values(checked, source)
     return checked
 
@@ -236,7 +262,7 @@ def _convert(value: Any, key: str, source: str) -> np.ndarray:
         raise DemonstrationsError(str(error)) from None
     except (ValueError, TypeError):  # from NumPy
         raise DemonstrationsError(f"{source}: '{key}' cannot be turned into an array of numbers; correct it") from None
-    if key not in _NUMBER_KEYS:
+    if key not in _FLOAT_KEYS:
         return array
     with np.errstate(over="ignore", invalid="ignore"):  # what does not fit float32 is reported as not finite
         return array.astype(np.float32)
@@ -257,12 +283,21 @@ def _check_episode_ends(ends: np.ndarray, num_steps: int, source: str) -> None:
         )
 
 
+def _check_final_obs(arrays: Mapping[str, np.ndarray], source: str) -> None:
+    wanted = (len(arrays["episode_ends"]), arrays["obs"].shape[1])
+    if "final_obs" in arrays and arrays["final_obs"].shape != wanted:
+        raise DemonstrationsError(
+            f"{source}: 'final_obs' has shape {arrays['final_obs'].shape}, must have shape {wanted}: the observation "
+            "after each trajectory's last step"
+        )
+
+
 def _check_values(checked: Demonstrations, source: str) -> None:
     def fail(key: str, row: int, complaint: str) -> None:
-        trajectory = int(np.searchsorted(checked.episode_ends, row, side="right"))
+        trajectory = row if key == "final_obs" else int(np.searchsorted(checked.episode_ends, row, side="right"))
         raise DemonstrationsError(f"{source}: '{key}' {complaint} (trajectory {trajectory}, row {row})")
 
-    for key in _NUMBER_KEYS:
+    for key in _FLOAT_KEYS:
         value = getattr(checked, key)
         if value is not None:
             finite = np.isfinite(value).reshape(len(value), -1).all(axis=1)

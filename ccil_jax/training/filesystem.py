@@ -53,6 +53,21 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
         yield
 
 
+def content_sha256(path: Path) -> str | None:
+    """What tells the content of a file or folder from another: for a file its SHA-256; None where nothing is there.
+
+    For a folder it is the digest of the names and digests of all files in it, so it does not depend on where the folder
+    is. Links are not followed.
+    """
+    if path.is_file():
+        return file_sha256(path)
+    if not path.is_dir():
+        return None
+    files = sorted(file for file in path.rglob("*") if file.is_file() and not file.is_symlink())
+    lines = [f"{file_sha256(file)}  {file.relative_to(path).as_posix()}\n" for file in files]
+    return hashlib.sha256("".join(lines).encode(errors="surrogateescape")).hexdigest()
+
+
 def file_sha256(path: Path) -> str:
     """The SHA-256 digest of a file's bytes, hexadecimal."""
     with path.open("rb") as file:

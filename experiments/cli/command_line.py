@@ -40,6 +40,11 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
 
+    @property
+    def actions(self) -> tuple[argparse.Action, ...]:
+        """All options and positional arguments, in the order in which they were added."""
+        return tuple(self._actions)
+
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As in argparse, but suggests the nearest option for an unknown one."""
         given = [_hyphenated(a) for a in (sys.argv[1:] if args is None else args)]

@@ -28,6 +28,7 @@ DEFAULTS: Mapping[str, Any] = {
     **dict.fromkeys(TASK_OPTIONS),
     "preset": "default",
     "eval_episodes": 50,
+    "wandb": None,
 }
 
 
@@ -65,6 +66,12 @@ def add_run_options(parser: Parser, defaults: Mapping[str, Any] = DEFAULTS) -> N
     )
     add("max_episode_steps", "time limit of an episode (default: the task's, mostly 1000)", type=positive, metavar="T")
     add("eval_episodes", "evaluation episodes per seed after training", type=positive, metavar="N")
+    add(
+        "wandb",
+        "also log the metrics in this project of Weights & Biases (with WANDB_MODE=offline they are kept "
+        "in the run folder, to be sent later)",
+        metavar="PROJECT",
+    )
 
 
 def add_config_options(parser: Parser, preset: str, *, methods: Sequence[str] = tuple(METHODS)) -> None:

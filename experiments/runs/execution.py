@@ -147,6 +147,8 @@ def _train(
     columns = combining.columns(len(program.runs), setup.num_seeds)
     with contextlib.ExitStack() as stack:
         log = RunLog(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
+        for place in log.places:
+            display.message(f"Weights & Biases: {place}")
 
         def on_start(history: "History") -> None:
             log.begin(history)

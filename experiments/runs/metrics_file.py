@@ -4,7 +4,7 @@ import contextlib
 import csv
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TextIO
@@ -71,6 +71,40 @@ def read_metrics(folder: Path) -> dict[str, np.ndarray]:
     return without_unknown(metrics)  # earlier versions wrote numbers before there were any
 
 
+def columns_of(metrics: Mapping[str, np.ndarray]) -> list[str]:
+    """The names of the metrics that a method reports, in the order of the columns of metrics.csv."""
+    known = [name for name in METRICS if name in metrics]
+    return known + sorted(set(metrics) - set(known))
+
+
+def rows_of(metrics: Mapping[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    """The metrics `[iterations, num_seeds]` of these names as one array `[iterations, num_seeds, names]`, float64."""
+    return np.stack([np.asarray(metrics[name], np.float64) for name in names], axis=-1)
+
+
+def tagged(iteration: int, names: Sequence[str], row: np.ndarray) -> tuple[int, dict[str, float]]:
+    """An iteration as logs of events have it.
+
+    Args:
+        iteration: its number, from 1.
+        names: of the metrics, `env_steps` among them.
+        row: `[num_seeds, names]`; NaN where a value is unknown.
+
+    Returns:
+        The place on the axis, in environment steps, and the known values under `mean/NAME` and `seed_N/NAME`.
+    """
+    # Behaviour cloning takes no environment steps; its axis is the number of iterations.
+    steps = int(row[0, names.index("env_steps")]) or iteration
+    groups = {"mean": known_mean(row, axis=0), **{f"seed_{s}": numbers for s, numbers in enumerate(row)}}
+    values = {
+        f"{group}/{name}": float(numbers[i])
+        for i, name in enumerate(names)
+        for group, numbers in groups.items()
+        if name != "env_steps" and not math.isnan(numbers[i])
+    }
+    return steps, values
+
+
 class MetricsWriter:
     """Writes metrics.csv and TensorBoard events, a chunk of iterations at a time; use it as a context manager.
 
@@ -110,10 +144,9 @@ class MetricsWriter:
     def _append(self, file: TextIO, metrics: Mapping[str, np.ndarray], first: int) -> np.ndarray:
         writer = csv.writer(file, lineterminator="\n")
         if not self._names:
-            known = [name for name in METRICS if name in metrics]
-            self._names = known + sorted(set(metrics) - set(known))
+            self._names = columns_of(metrics)
             writer.writerow(["iteration", "seed", *self._names])
-        rows = np.stack([np.asarray(metrics[name], np.float64) for name in self._names], axis=-1)
+        rows = rows_of(metrics, self._names)
         for number, row in enumerate(rows, first + 1):
             writer.writerows([number, s, *(_text(x) for x in values)] for s, values in enumerate(row))
         return rows
@@ -122,15 +155,8 @@ class MetricsWriter:
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.proto.summary_pb2 import Summary
 
-        # Behaviour cloning takes no environment steps; its axis is the number of iterations.
-        steps = int(row[0, self._names.index("env_steps")]) or iteration
-        means = known_mean(row, axis=0)
-        values = [
-            Summary.Value(tag=f"{group}/{name}", simple_value=numbers[i])
-            for i, name in enumerate(self._names)
-            for group, numbers in (("mean", means), *((f"seed_{s}", numbers) for s, numbers in enumerate(row)))
-            if name != "env_steps" and not math.isnan(numbers[i])
-        ]
+        steps, numbers = tagged(iteration, self._names, row)
+        values = [Summary.Value(tag=tag, simple_value=number) for tag, number in numbers.items()]
         self._events.write_event(Event(wall_time=time.time(), step=steps, summary=Summary(value=values)))
 
     def __enter__(self) -> Self:

@@ -14,6 +14,7 @@ from ccil_jax.methods import METHODS, find_method
 from envs.registry import TaskInfo
 from experiments.cli import command_line, options
 from experiments.cli.command_line import Parser, UsageError
+from experiments.runs import demonstration_files, wandb_log
 
 _EVALUATION_SEED_OFFSET = 10_000_019  # so that evaluation draws other random numbers than training with the same --seed
 
@@ -50,6 +51,7 @@ class RunPlan:
     folder: Path
     resume: bool
     command: str
+    wandb: str | None = None  # project at Weights & Biases that the metrics go to as well
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -98,7 +100,11 @@ def add_options(parser: Parser, *, with_method: bool = True) -> None:
         parser.add_argument("--method", default=absent, metavar="NAME", help=text)
     options.add_run_options(parser)
     parser.add_argument(
-        "--demos", default=absent, type=Path, metavar="FILE", help="demonstrations (default: those shipped for --env)"
+        "--demos",
+        default=absent,
+        type=demonstration_files.to_read,
+        metavar="FILE",
+        help=f"demonstrations: {demonstration_files.TO_READ} (default: those shipped for --env)",
     )
     parser.add_argument(
         "--num-demos", default=absent, type=command_line.positive, metavar="K", help="use the first K trajectories only"
@@ -148,6 +154,8 @@ def plan_of(
     preset = find_method(named["method"]).preset
     choices = {**options.DEFAULTS, "preset": preset, "env": None, "demos": None, "num_demos": None, **named}
     config = options.config_from(given, choices["preset"], saved)
+    if choices["wandb"]:
+        wandb_log.check(choices["wandb"])
     task = options.find_task(choices["env"])
     env_options = options.env_options(choices, task)
     path, demonstrations = find_demonstrations(config, task, choices["demos"], choices["num_demos"], env_options, load)
@@ -160,6 +168,7 @@ def plan_of(
         folder=folder or command_line.default_folder(task.name, config.method),
         resume=resume,
         command=command_line.command(),
+        wandb=choices["wandb"],
     )
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import relevant
-from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.filesystem import content_sha256
 from experiments.cli import options
 from experiments.cli.command_line import UsageError
 from experiments.runs import run_folder
@@ -43,7 +43,7 @@ def resumed(
             )
     # The file may have been moved. It is the same file if its digest is the same.
     path: Path | None = given.get("demos", saved["demos"])
-    if path and path.is_file() and demos and file_sha256(path) != demos["sha256"]:
+    if path and path.exists() and demos and content_sha256(path) != demos["sha256"]:
         raise UsageError(f"--demos {path}: not the file that the run in {folder} began with; give that file")
     return {**saved, "demos": path}
 
@@ -79,7 +79,7 @@ def repeated(path: Path, content: dict[str, Any], given: Mapping[str, Any]) -> d
     demos, saved = run.facts["demonstrations"], options_of(run)
     if demos and "demos" not in given:
         file: Path = saved["demos"]
-        if not file.is_file() or file_sha256(file) != demos["sha256"]:
+        if content_sha256(file) != demos["sha256"]:
             raise UsageError(
                 f"--config {path}: {file} is no longer the file that this run learnt from; give it by --demos"
             )

@@ -1,15 +1,17 @@
 """What a training leaves in the folders of its runs while it goes on: config.json, metrics.csv, and its speed."""
 
 import contextlib
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from ccil_jax.config import Config
-from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.training.filesystem import content_sha256
 from experiments.cli import options
 from experiments.runs import run_folder, summary
 from experiments.runs.metrics_file import MetricsWriter
 from experiments.runs.plans import RunPlan
+from experiments.runs.wandb_log import WandbWriter
 
 if TYPE_CHECKING:
     from ccil_jax.training.loop import History, Progress
@@ -30,7 +32,9 @@ class RunLog:
     ) -> None:
         self._steps_per_iteration = config.steps_per_iteration
         self._plans, self._env = [plan for plan, _ in runs], env
-        self._writers = [(stack.enter_context(MetricsWriter(plan.folder)), columns) for plan, columns in runs]
+        self._writers = [(writer, columns) for plan, columns in runs for writer in _writers_of(plan)]
+        for writer, _ in self._writers:
+            stack.enter_context(writer)
         self._steps = self._seconds = 0.0
 
     def begin(self, history: "History") -> None:
@@ -51,9 +55,25 @@ class RunLog:
             writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
 
     @property
+    def places(self) -> list[str]:
+        """Where else than in the run folders the metrics can be seen."""
+        return [writer.place for writer, _ in self._writers if isinstance(writer, WandbWriter)]
+
+    @property
     def env_steps_per_second(self) -> float | None:
         """Of all runs together, without compilation; None where no step was taken."""
         return self._steps / self._seconds if self._seconds else None
+
+
+def _writers_of(plan: RunPlan) -> list[MetricsWriter | WandbWriter]:
+    """What the metrics of a run go to."""
+    writers: list[MetricsWriter | WandbWriter] = [MetricsWriter(plan.folder)]
+    if plan.wandb:
+        setup = plan.setup
+        facts = {"task": setup.task, "preset": plan.preset, "seed": setup.seed, "num_seeds": setup.num_seeds}
+        config = {**dataclasses.asdict(plan.config), **facts, "command": plan.command}
+        writers.append(WandbWriter(plan.wandb, plan.folder, config))
+    return writers
 
 
 def write_config(plan: RunPlan, env: Any) -> None:
@@ -69,7 +89,7 @@ def _facts(plan: RunPlan, env: Any) -> dict[str, Any]:
     if setup.demonstrations_path is not None:
         demonstrations = {
             "file": str(setup.demonstrations_path.resolve()),
-            "sha256": file_sha256(setup.demonstrations_path),
+            "sha256": content_sha256(setup.demonstrations_path),
             "num_episodes": setup.num_demonstrations,
         }
     device = jax.devices()[0]

@@ -15,8 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import relevant
+from ccil_jax.demonstrations import minari_datasets
 from ccil_jax.demonstrations.trajectories import Demonstrations, load_demonstrations
-from ccil_jax.training.filesystem import file_sha256
+from ccil_jax.errors import DemonstrationsError
+from ccil_jax.training.filesystem import content_sha256
 from experiments.cli.command_line import UsageError
 from experiments.cli.names import safe_name
 from experiments.cli.settings_file import text
@@ -69,7 +71,9 @@ def make_variant(
     """
     if "demos" in fields:  # an absolute path, because a worker may be started in another folder
         try:
-            fields = {**fields, "demos": Path(fields["demos"]).resolve()}
+            fields = {**fields, "demos": minari_datasets.locate(fields["demos"]).resolve()}
+        except DemonstrationsError as error:
+            raise UsageError(f"--demos: {error}") from None
         except (TypeError, ValueError):
             raise UsageError(f"--demos {fields['demos']!r}: give the name of a file") from None
     return _variant(name, [f"--{field}={text(value)}" for field, value in fields.items()], out, load, alone=alone)
@@ -98,7 +102,7 @@ def check_unchanged(variant: Variant) -> None:
         if saved.get(name, value) != value:  # a folder of an older version may lack the name
             raise UsageError(f"--resume: {plan.folder} has {name} {saved[name]}, not {value}; choose another --out")
     demos = run.facts["demonstrations"]
-    if demos and setup.demonstrations_path and file_sha256(setup.demonstrations_path) != demos["sha256"]:
+    if demos and setup.demonstrations_path and content_sha256(setup.demonstrations_path) != demos["sha256"]:
         raise UsageError(f"--resume: {plan.folder} began with other demonstrations than {setup.demonstrations_path}")
 
 
