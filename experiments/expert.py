@@ -28,10 +28,11 @@ from experiments.runs.recording import choose_seed
 from experiments.runs.resuming import resumed
 
 DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
-# Fields that may change with --resume: an expert that misses its limit can be trained on with another limit, or with a
-# multiplier that reacts more strongly.
+# Fields that may change with --resume: an expert that misses its limit can be trained on with another limit, with a
+# multiplier that reacts more strongly, or with smaller steps, where its cost scatters from one policy to the next.
 MOVABLE = (
     "cost_limit",
+    "max_kl",
     "multiplier_learning_rate",
     "multiplier_max",
     "pid_proportional_gain",
