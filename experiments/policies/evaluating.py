@@ -88,8 +88,13 @@ def load_file(file: PolicyFile, task: TaskInfo) -> Loaded:
         UserError: the task cannot be built, or the policies do not fit it.
     """
     training = file.training
-    env = build_environment(task.name, training["physics"], training["env_options"])
+    return on_environment(file, task, build_environment(task.name, training["physics"], training["env_options"]))
+
+
+def on_environment(file: PolicyFile, task: TaskInfo, env: Any) -> Loaded:
+    """The policies of a file on `env`, an environment of `task`. Raises `UserError` where they do not fit it."""
     file.check_sizes(env.obs_dim, env.action_dim)
+    training = file.training
     return Loaded(
         source=file.path.resolve(),
         task=task,
