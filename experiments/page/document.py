@@ -113,5 +113,6 @@ def _policies_section(files: Sequence[PolicyFile], play: Callable[[PolicyFile, i
         results = plots.of_file(file, f"{file.training['method']} ({file.path.name})")
         if results:
             by_task.setdefault(file.training["task"], []).append(results)
-    yield from (plots.of_policies(results, task) for task, results in by_task.items())
+    if by_task:
+        yield plots.of_policies(by_task)
     yield from (play(file, index) for file in files for index in range(file.num_policies) if play)

@@ -14,6 +14,7 @@ from experiments.page.player import legend
 from experiments.policies.policy_file import PolicyFile
 from experiments.runs import figures
 from experiments.runs.figures import COLORS, Curve, Panel
+from experiments.runs.labels import literal
 
 _INK, _LIMIT = "#22262b", "#a0281f"
 
@@ -91,11 +92,14 @@ def of_curves(entries: Sequence[Entry]) -> str:
     return f"{_legend(results)}<figure>{_grid(images)}<figcaption>{note}</figcaption></figure>{more}"
 
 
-def of_policies(results: Sequence[Results], task: str) -> str:
-    """The HTML of return against cost of policies of one task."""
-    caption = f"{task}: means over episodes with standard errors; the star is the expert, the line the cost limit."
-    image = _grid([_scatter(results)])
-    return f"{_legend(results)}<figure>{image}<figcaption>{caption}</figcaption></figure>"
+def of_policies(by_task: Mapping[str, Sequence[Results]]) -> str:
+    """The HTML of return against cost of policies, a plot for each task."""
+    plots = (
+        f"<div>{_legend(results)}{_scatter(results, f'{task}: return against cost')}</div>"
+        for task, results in by_task.items()
+    )
+    note = "Means with standard errors over episodes. The line is the cost limit; a star, if there is one, the expert."
+    return f"<figure>{_grid([*plots])}<figcaption>{note}</figcaption></figure>"
 
 
 def _points(curves: Sequence[Curve]) -> str:
@@ -105,7 +109,8 @@ def _points(curves: Sequence[Curve]) -> str:
 
 def _legend(results: Sequence[Results]) -> str:
     rows = [(COLORS[i % len(COLORS)], found.label) for i, found in enumerate(results)]
-    return legend([*rows, (_INK, "expert")])
+    has_expert = any(found.levels.get("expert_return") is not None for found in results)
+    return legend([*rows, *([(_INK, "expert")] * has_expert)])
 
 
 def _panels(panels: Sequence[Panel]) -> list[str]:
@@ -116,12 +121,11 @@ def _grid(images: Sequence[str]) -> str:
     return f"<div class=panels>{''.join(images)}</div>"
 
 
-def _scatter(results: Sequence[Results]) -> str:
-    image = figures.png(draw_return_against_cost(results))
-    return figures.html_image(image, "return against cost of all runs and of the expert")
+def _scatter(results: Sequence[Results], title: str = "Return against cost") -> str:
+    return figures.html_image(figures.png(draw_return_against_cost(results, title)), title)
 
 
-def draw_return_against_cost(results: Sequence[Results]) -> Figure:
+def draw_return_against_cost(results: Sequence[Results], title: str) -> Figure:
     """Every seed, the mean over the seeds of each training with its error over episodes, the expert and the limit."""
     with mpl.rc_context(figures.SMALL_STYLE):
         figure = Figure(figsize=figures.SMALL, dpi=150, layout="constrained")
@@ -135,7 +139,7 @@ def draw_return_against_cost(results: Sequence[Results]) -> Figure:
             middle = found.costs.mean(), found.returns.mean()
             axes.errorbar(*middle, y_error, x_error, fmt="o", color=color, markersize=8, capsize=3, zorder=3)
         _draw_levels(axes, results)
-        axes.set_title("Return against cost")
+        axes.set_title(literal(title))
         axes.set_xlabel("cost per episode")
         axes.set_ylabel("return")
         axes.margins(0.12)

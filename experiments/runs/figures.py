@@ -213,7 +213,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Any]:
     entries |= _draw_levels(axes, list(panel.curves.values()), panel.metric)
     if all(np.isnan(curve.metrics[panel.metric]).all() for curve in panel.curves.values()):
         axes.set_xticks([])
-        axes.text(0.5, 0.5, "not known yet", transform=axes.transAxes, ha="center", va="center", color="#4a4f57")
+        axes.text(0.5, 0.2, "not known yet", transform=axes.transAxes, ha="center", color="#4a4f57")
     axes.set_title(literal(panel.title))
     if panel.cloning:
         axes.set_xlabel(" or ".join(dict.fromkeys(curve.iteration for curve in panel.curves.values())))
