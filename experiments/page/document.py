@@ -80,7 +80,7 @@ def page(
         parts += _task_section(task, runs, seed, play_run)
     if files:
         parts += _policies_section(files, play_policy)
-    if play_run or play_policy:
+    if any(part.startswith("<figure class='player") for part in parts):
         from experiments.page import player  # imports MuJoCo
 
         parts.append(player.script())
@@ -95,7 +95,7 @@ def _task_section(
     yield f"<h2>{text(task)}</h2>"
     yield tables.metrics(entries, seed)
     yield plots.of_curves(entries)
-    yield from (play_run(e) for e in entries if play_run)
+    yield from (played for e in entries if play_run and (played := play_run(e)))
     yield f"<details><summary>Every seed</summary>{tables.seeds(entries)}</details>"
     yield "<details><summary>How the runs differ, and where they were made</summary>"
     yield f"{tables.differences(entries)}</details>"
@@ -115,4 +115,5 @@ def _policies_section(files: Sequence[PolicyFile], play: Callable[[PolicyFile, i
             by_task.setdefault(file.training["task"], []).append(results)
     if by_task:
         yield plots.of_policies(by_task)
-    yield from (play(file, index) for file in files for index in range(file.num_policies) if play)
+    shown = ((file, index) for file in files for index in range(file.num_policies))
+    yield from (played for file, index in shown if play and (played := play(file, index)))
