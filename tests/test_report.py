@@ -19,7 +19,7 @@ from ccil_jax.config import Config
 from ccil_jax.training.progress import Display
 from experiments import benchmark, report
 from experiments.cli.command_line import UsageError
-from experiments.page import document
+from experiments.page import document, plots
 from experiments.page.entries import choose_seed, read_entries
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.metrics_file import MetricsWriter, read_metrics
@@ -256,6 +256,41 @@ def test_curves_of_single_seeds_and_of_none_that_is_known() -> None:
     assert np.isnan(np.asarray(figure.axes[0].lines[-1].get_ydata())).all()
     assert figure.get_suptitle() == "Swimmer: one seed"
     assert figures.png(figure).startswith(b"\x89PNG")
+
+
+def test_return_is_drawn_against_cost(tmp_path: Path) -> None:
+    """Means over seeds and, with its standard errors, the expert; the line is the cost that is allowed."""
+    entries = read_entries([make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "gail", level=70.0)])
+    axes = plots.draw_return_against_cost([plots.of_run(e) for e in entries], "x").axes[0]
+    drawn = []
+    for bars in axes.containers:
+        (cost,), (level,) = bars.lines[0].get_data()
+        lengths = [float(np.ptp(line.get_segments()[0], axis=0).max()) / 2 for line in bars.lines[2]]
+        drawn.append((cost, level, *lengths))
+    mean = float(np.sqrt(3)) / 3
+    expected = [(33.0, 60.0, 0.25 * mean, 0.5 * mean), (33.0, 80.0, 0.25 * mean, 0.5 * mean), (30.0, 100.0, 1.5, 2.0)]
+    np.testing.assert_allclose(drawn, expected, rtol=1e-6)
+    assert list(axes.lines[-1].get_xdata()) == [30.0, 30.0]
+    seeds = [np.asarray(line.get_ydata()).tolist() for line in axes.lines if len(line.get_xdata()) == 3]
+    assert seeds == [[50.0, 60.0, 70.0], [70.0, 80.0, 90.0]]
+
+
+def test_what_goes_on_inside_a_method_is_drawn_where_there_is_something(tmp_path: Path) -> None:
+    nan, ones = np.full((3, 2), np.nan), np.ones((3, 2))
+    metrics = {"env_steps": ones, "episode_return": ones, "multiplier": 0 * ones, "meta_gradient": nan}
+    curves = [
+        figures.Curve("gail", {**metrics, "discriminator_accuracy_held_out": ones}, {}, None),
+        figures.Curve("malm", {**metrics, "multiplier": ones}, {}, None),
+    ]
+    panels = [(panel.metric, list(panel.curves)) for panel in figures.inner_panels_of(curves)]
+    assert panels == [("multiplier", [1]), ("discriminator_accuracy_held_out", [0])]
+    folder = make_run(tmp_path / "a", "malm")
+    assert "Inside the methods" not in make_page([folder])
+    metrics = {name: np.vstack([rows, rows]) for name, rows in read_metrics(folder).items()}
+    with MetricsWriter(folder) as writer:
+        writer.begin({**metrics, "multiplier": metrics["env_steps"]})
+    page = Page(make_page([folder]))
+    assert len(page.addresses) == 5
 
 
 def test_cloning_is_drawn_against_its_iterations_beside_runs_that_take_steps(tmp_path: Path) -> None:

@@ -43,9 +43,9 @@ function play(figure) {
 
   button.addEventListener("click", () => {
     if (startedAt !== null) return pause();
-    if (frame === last) frame = 0;
+    startedFrom = frame = frame === last ? 0 : frame;
     startedAt = performance.now();
-    startedFrom = frame;
+    show();
     button.textContent = "Pause";
     requestAnimationFrame(tick);
   });
