@@ -66,7 +66,7 @@ def test_an_mp4_lasts_as_long_as_the_episode(tmp_path: Path) -> None:
     assert seconds == pytest.approx(19 * 0.032 + 1, abs=0.05)
     command = [ffmpeg.get_ffmpeg_exe(), "-i", str(tmp_path / "a.mp4"), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     decoded = subprocess.run(command, capture_output=True, check=True).stdout
-    frames = np.frombuffer(decoded, np.uint8).reshape(count, 544, 480, 3)
+    frames = np.frombuffer(decoded, np.uint8).reshape(count, 572, 480, 3)
     assert has_red(frames[2])
     assert not has_red(frames[0])
     assert np.abs(frames[0].astype(int) - frames[19]).max() > 100

@@ -19,6 +19,7 @@ SUFFIXES = (".gif", ".mp4")
 _WIDTH = 640  # pixels; of an arena less, as its pictures are square
 _ARENA_WIDTH = 480
 _HEADER = 64  # pixels, above the picture: a title, and return and cost so far
+_LEGEND = 28  # pixels, below that: the colours of an arena's objects
 _FINER = 2  # pictures are drawn larger by this factor and then reduced, so that edges are smooth
 _INK, _SOFT, _GRID, _FLOOR = "#22262b", "#5b626c", "#e3e6ea", "#8a8f98"
 _LAST_FRAME = 1.0  # s that the last frame stays, before a GIF begins again
@@ -104,16 +105,18 @@ class _Canvas:
     """A picture under way; lengths are in metres."""
 
     def __init__(self, film: "Film", index: int) -> None:
-        width = _FINER * (_ARENA_WIDTH if film.view == "arena" else _WIDTH)
+        is_arena = film.view == "arena"
+        width = _FINER * (_ARENA_WIDTH if is_arena else _WIDTH)
+        self.top = _FINER * (_HEADER + is_arena * _LEGEND)
         self.width, self.height = width, round(width / film.aspect)
         self.scale = self.height / film.span  # pixels per metre
         self.centre = film.centre[index]
-        self.picture = Image.new("RGB", (width, self.height + _FINER * _HEADER), "white")
+        self.picture = Image.new("RGB", (width, self.height + self.top), "white")
         self.pen = ImageDraw.Draw(self.picture, "RGBA")  # blends colours that are not opaque
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
         """Where points [..., 2] are in the picture."""
-        middle = np.array([self.width / 2, self.height / 2 + _FINER * _HEADER])
+        middle = np.array([self.width / 2, self.height / 2 + self.top])
         where: np.ndarray = middle + (points - self.centre) * self.scale * [1, -1]
         return where
 
@@ -130,6 +133,12 @@ class _Canvas:
             for x, y in pixels if length > 0 else pixels[:1]:
                 self.pen.ellipse((x - half, y - half, x + half, y + half), fill=color)
 
+    def write(self, place: tuple[float, float], text: str, size: int, color: str) -> float:
+        """Writes a line of text at a place of the reduced picture, in pixels; returns its length."""
+        font = ImageFont.load_default(size=_FINER * size)
+        self.pen.text((_FINER * place[0], _FINER * place[1]), text, fill=color, font=font)
+        return float(self.pen.textlength(text, font=font)) / _FINER
+
 
 def draw(film: "Film", index: int, title: str, cost_limit: float | None = None) -> Image.Image:
     """The frame `index` of a film as a picture, with the running return and cost above it."""
@@ -144,16 +153,18 @@ def draw(film: "Film", index: int, title: str, cost_limit: float | None = None) 
         is_red = film.paid[index] and shape.kind in ("body", "robot")
         color = PAID if is_red else COLORS[shape.kind]
         canvas.line(place.reshape(2, 2), shape.width, color, is_round=shape.is_round)
-    canvas.pen.rectangle((0, 0, canvas.width, _FINER * _HEADER), fill="white")
+    canvas.pen.rectangle((0, 0, canvas.width, canvas.top), fill="white")
     step, of = film.steps[index], film.steps[-1]
     limit = "" if cost_limit is None else f" (limit {_amount(cost_limit)})"
-    seconds = f"step {step} of {of}, {step * film.dt:.1f} s"
+    canvas.write((12, 8), f"{title}   step {step} of {of}, {step * film.dt:.1f} s", 15, _SOFT)
     reached = f"return {number(film.returns[index])}   cost {_amount(film.costs[index])}{limit}"
-    for row, (text, color) in enumerate(
-        [(f"{title}   {seconds}", _SOFT), (reached, PAID if film.paid[index] else _INK)]
-    ):
-        font = ImageFont.load_default(size=_FINER * (15 + 3 * row))
-        canvas.pen.text((_FINER * 12, _FINER * (8 + 24 * row)), text, fill=color, font=font)
+    canvas.write((12, 32), reached, 18, PAID if film.paid[index] else _INK)
+    if film.view == "arena":
+        x = 12.0
+        for kind in dict.fromkeys(shape.kind for shape in film.strokes.shapes):
+            box = np.array([x, _HEADER + 6, x + 12, _HEADER + 18])
+            canvas.pen.rectangle(tuple(_FINER * box), fill=COLORS[kind])
+            x += 28 + canvas.write((x + 17, _HEADER + 3), kind.replace("_", " "), 14, _SOFT)
     return canvas.picture.reduce(_FINER)
 
 
