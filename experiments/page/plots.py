@@ -31,6 +31,12 @@ class Results:
     levels: Mapping[str, float | None]  # `summary.levels_of`
     cost_limit: float | None  # a limit that was prescribed
 
+    @property
+    def allowed_cost(self) -> float | None:
+        """The cost above which there is a violation, as in `summary.Reference`."""
+        expert_cost = self.levels.get("expert_cost")
+        return self.cost_limit if expert_cost is None else expert_cost
+
 
 def of_run(entry: Entry) -> Results:
     """The results of a run, from its summary."""
@@ -152,5 +158,5 @@ def _draw_levels(axes: Any, results: Sequence[Results]) -> None:
         if cost is not None and level is not None:
             style: Any = {"fmt": "*", "color": _INK, "markersize": 12, "capsize": 3, "zorder": 4}
             axes.errorbar(cost, level, level_error, cost_error, **style)
-    for limit in {found.levels.get("expert_cost") or found.cost_limit for found in results} - {None}:
+    for limit in {found.allowed_cost for found in results} - {None}:
         axes.axvline(limit, color=_LIMIT, linewidth=1.2, linestyle=(0, (1, 2)))
