@@ -45,7 +45,7 @@ def test_a_film_is_the_episode_of_its_policy() -> None:
     loaded = untrained("Hopper")
     shown = film.record(loaded, 1, seed=3, deterministic=True)
     env, policy = loaded.env, policies(loaded.config, loaded.actor, loaded.env)[1]
-    state, step = env.reset(jax.random.split(jax.random.key(3))[0]), jax.jit(env.step)
+    state, step = jax.jit(env.reset)(jax.random.split(jax.random.key(3))[0]), jax.jit(env.step)
     while not state.done:
         state = step(state, policy.mode(np.asarray(state.obs)).astype(np.float32))
     length = int(state.step_count)
@@ -66,7 +66,7 @@ def test_an_arena_shows_robot_and_objects_where_they_are() -> None:
     shown = film.record(loaded, 0, seed=1)
     kinds = [shape.kind for shape in shown.strokes.shapes]
     assert kinds == ["goal", *["hazards"] * 8, "vases", "robot", "robot"]
-    start = loaded.env.reset(jax.random.split(jax.random.key(1))[0])
+    start = jax.jit(loaded.env.reset)(jax.random.split(jax.random.key(1))[0])
     objects = loaded.env.situation(start.physics).objects
     for i, kind in enumerate(["goal", *["hazards"] * 8]):
         centre = objects[kind][max(0, i - 1)][:2]
