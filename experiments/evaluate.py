@@ -3,28 +3,28 @@
 With --policy, the policies of a file are evaluated in place of a run's: one that --export wrote, or a shipped expert.
 The result file keeps all evaluations: the newest of each simulator under the simulator's name, older ones under
 `earlier`. With --record, the policy of one seed is also recorded as demonstrations, as `expert` does it. With --export,
-the policies of all seeds, or that of --seed-index, are also written to files that other programs can use.
+the policies of all seeds, or that of --seed-index, are also written to files that other programs can use. With --video,
+an episode of one seed is also drawn; no display and no renderer is needed.
 """
 
 import argparse
-import dataclasses
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import save_demonstrations
-from envs import registry
 from envs.registry import TaskInfo
-from experiments.cli import command_line, xla
+from experiments.cli import command_line, waiting, xla
 from experiments.cli.command_line import Parser, UsageError
-from experiments.policies import evaluating, policy_file
+from experiments.page import video
+from experiments.policies import evaluating, sources
 from experiments.policies.evaluating import Loaded, Settings
 from experiments.policies.numpy_policy import is_known
-from experiments.runs import demonstration_files, evaluations, recording, run_folder, summary
-from experiments.runs.run_folder import Run
+from experiments.policies.sources import Source
+from experiments.runs import demonstration_files, evaluations, recording, summary
 
 _NUM_TRAJECTORIES = 10  # to record, unless said otherwise
 
@@ -83,11 +83,19 @@ def _add_files(parser: Parser) -> None:
         f"{demonstration_files.TO_WRITE}",
     )
     parser.add_argument(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help="also write a video of an episode in our simulator, with running return and cost: FILE.gif, or FILE.mp4 "
+        "with the package imageio-ffmpeg",
+    )
+    parser.add_argument(
         "--seed-index",
         type=command_line.natural,
         metavar="N",
-        help="the seed to record and to export (default: --export writes all; --record chooses as `expert` does, the "
-        "seed with the highest return among those within the cost limit)",
+        help="the seed to record, to export and to show (default: --export writes all; --record chooses as `expert` "
+        "does, the seed with the highest return among those within the cost limit; --video shows the seed with the "
+        "highest return)",
     )
     parser.add_argument(
         "--num-trajectories",
@@ -95,7 +103,9 @@ def _add_files(parser: Parser) -> None:
         metavar="K",
         help=f"episodes to record (default: {_NUM_TRAJECTORIES})",
     )
-    parser.add_argument("--overwrite", action="store_true", help="replace existing files of --export and --record")
+    parser.add_argument(
+        "--overwrite", action="store_true", help="replace existing files of --export, --record and --video"
+    )
     parser.add_argument(
         "--out",
         type=Path,
@@ -108,7 +118,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Checks everything, plays the episodes, writes the results and prints them."""
     if (arguments.run is None) == (arguments.policy is None):
         raise UsageError("RUN_DIR: give the folder of a run, or --policy FILE.npz; one of the two")
-    source = _find_run(arguments) if arguments.run else _find_policies(arguments)
+    source = sources.of_run(arguments.run) if arguments.run else sources.of_file(arguments.policy)
     path = arguments.out or (arguments.run / "evaluation.json" if arguments.run else None)
     if path:
         evaluations.read(path)
@@ -117,68 +127,25 @@ def run(arguments: argparse.Namespace) -> None:
     check_policy(arguments, source.config)
     files = check_files(arguments, path)
     check_recording(arguments, source)
+    check_video(arguments, source)
     for option, file in files:
         demonstration_files.check_writable(file, option)
     xla.spread_seeds(len(source.seeds))
     loaded, settings = source.load(), _settings(arguments)
-    episodes = evaluating.play(loaded, settings)
+    unit = "steps" if arguments.simulator == "ours" else "episodes"
+    with waiting.progress("evaluating", unit) as on_progress:
+        episodes = evaluating.play(loaded, settings, on_progress)
     content, reference = evaluating.judge(loaded, settings, episodes)
     _export(arguments, loaded, episodes, settings)
     if arguments.record:
         _record(arguments, source, loaded, content)
+    if arguments.video:
+        _write_video(arguments, source, loaded, content)
     title = f"{source.title}, {arguments.episodes} episodes per seed, {arguments.simulator} simulator"
     summary.print_table(title, content["per_seed"], content["aggregate"], reference)
     if path:
         evaluations.add(path, content)
         print(f"written to {path}")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Source:
-    """Where policies come from, before JAX is imported: a run or a file."""
-
-    title: str
-    task: TaskInfo
-    config: Config
-    seeds: Sequence[int]  # of the policies, as the user calls them
-    load: Callable[[], Loaded]
-    run: Run | None  # None for a file
-
-
-def _find_run(arguments: argparse.Namespace) -> Source:
-    if not arguments.run.is_dir():
-        raise UsageError(f"RUN_DIR {arguments.run}: no such folder; give a folder that `train` wrote")
-    stored = run_folder.read_run(arguments.run)
-    task = run_folder.task_of(stored)
-    checkpoints = arguments.run / "checkpoints"
-    if not checkpoints.is_dir() or not any(checkpoints.iterdir()):
-        raise UsageError(f"RUN_DIR {arguments.run}: holds no checkpoint; train first, or resume with `train --resume`")
-    return Source(
-        title=f"{stored.config.method} on {task.name}",
-        task=task,
-        config=stored.config,
-        seeds=range(stored.facts["num_seeds"]),
-        load=lambda: evaluating.load(stored),
-        run=stored,
-    )
-
-
-def _find_policies(arguments: argparse.Namespace) -> Source:
-    file = policy_file.read(policy_file.find(arguments.policy))
-    training = file.training
-    if training["task"] not in registry.TASKS:  # a module that a file names is not imported: it would run its code
-        raise UsageError(
-            f"--policy {arguments.policy}: of task {training['task']}, which is none of this package; give the folder "
-            "of its run"
-        )
-    return Source(
-        title=f"{training['method']} on {training['task']}",
-        task=registry.TASKS[training["task"]],
-        config=file.config,
-        seeds=training["seed_indices"],
-        load=lambda: evaluating.load_file(file, registry.TASKS[training["task"]]),
-        run=None,
-    )
 
 
 def check_original(task: TaskInfo) -> None:
@@ -205,7 +172,7 @@ def check_policy(arguments: argparse.Namespace, config: Config) -> None:
 
 
 def check_files(arguments: argparse.Namespace, path: Path | None) -> list[tuple[str, Path]]:
-    """The files that are to be written, each with its option: the result file `path`, if any, then --export, --record.
+    """The files that are to be written, each with its option: the result file `path`, if any, then all others.
 
     Raises:
         UsageError: a file's name has an unknown ending, or the file would replace another.
@@ -215,10 +182,13 @@ def check_files(arguments: argparse.Namespace, path: Path | None) -> list[tuple[
             raise UsageError(f"--export {file}: unknown kind of file; end its name with .npz, .onnx or .stablehlo")
         if file.suffix == ".onnx" and importlib.util.find_spec("onnx") is None:
             raise UsageError(f"--export {file}: needs the package onnx; `pip install 'ccil_jax[onnx]'`")
+    if arguments.video:
+        video.check(arguments.video, "--video")
     written = [("--export", file) for file in arguments.export]
     written += [("--record", arguments.record)] if arguments.record else []
+    written += [("--video", arguments.video)] if arguments.video else []
     if arguments.overwrite and not written:
-        raise UsageError("--overwrite: for files of --export and --record, and neither is given; leave it out")
+        raise UsageError("--overwrite: for files of --export, --record and --video; none is given, leave it out")
     results = [("--out", path)] if path else []
     taken = {path.resolve() for _, path in results}
     for option, file in written:
@@ -237,9 +207,10 @@ def check_recording(arguments: argparse.Namespace, source: Source) -> None:
             raise UsageError(
                 f"--num-trajectories {arguments.num_trajectories}: says what to record; add --record FILE.npz"
             )
-        if arguments.seed_index is not None and not arguments.export:
+        if arguments.seed_index is not None and not arguments.export and not arguments.video:
             raise UsageError(
-                f"--seed-index {arguments.seed_index}: says what to record or export; add --record or --export FILE.npz"
+                f"--seed-index {arguments.seed_index}: says what to record, export or show; add --record FILE.npz, "
+                "--export FILE.npz or --video FILE.gif"
             )
     if arguments.record and arguments.deterministic:
         raise UsageError("--deterministic: demonstrations are recorded from sampled actions; leave one of the two out")
@@ -250,6 +221,14 @@ def check_recording(arguments: argparse.Namespace, source: Source) -> None:
         raise UsageError(f"--seed-index {arguments.seed_index}: there is no such seed; give one of {known}")
     if arguments.record and source.run:
         recording.find_seed(source.run, recording.read_summary(source.run)["per_seed"], arguments.seed_index)
+
+
+def check_video(arguments: argparse.Namespace, source: Source) -> None:
+    """Raises `UsageError` where there is nothing to show in a video."""
+    if arguments.video and source.task.view is None:
+        raise UsageError(f"--video {arguments.video}: task {source.task.name} cannot be drawn; leave it out")
+    if arguments.video and arguments.simulator == "original":
+        raise UsageError("--simulator original: videos are made in ours; leave one of the two out")
 
 
 def describe_recording(
@@ -314,6 +293,20 @@ def _record(arguments: argparse.Namespace, source: Source, loaded: Loaded, conte
     )
     save_demonstrations(arguments.record, demonstrations)
     recording.print_demonstrations(demonstrations, arguments.record)
+
+
+def _write_video(arguments: argparse.Namespace, source: Source, loaded: Loaded, content: Mapping[str, Any]) -> None:
+    from experiments.page import film  # imports MuJoCo
+
+    rows = content["per_seed"]
+    index = max(range(len(rows)), key=lambda i: rows[i]["episode_return"])
+    if arguments.seed_index is not None:
+        index = source.seeds.index(arguments.seed_index)
+    recorded = film.record(loaded, index, seed=arguments.seed, deterministic=arguments.deterministic)
+    title, limit = f"{source.title}, seed {source.seeds[index]}", loaded.training["cost_limit"]
+    with waiting.progress("drawing", "frames") as on_progress:
+        video.write(arguments.video, recorded, title, cost_limit=limit, on_progress=on_progress)
+    print(f"video    {arguments.video}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

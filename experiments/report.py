@@ -4,16 +4,18 @@ With --policies, it also shows policies of files at work: those of `evaluate --e
 """
 
 import argparse
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.cli import command_line
+from experiments.cli import command_line, waiting
 from experiments.cli.command_line import Parser, UsageError
 from experiments.cli.names import safe_name
 from experiments.page import document
-from experiments.page.entries import read_entries
+from experiments.page.entries import Entry, read_entries
 from experiments.policies import policy_file
+from experiments.policies.policy_file import PolicyFile
 
 
 def make_parser() -> Parser:
@@ -63,17 +65,36 @@ def run(arguments: argparse.Namespace) -> None:
         for task in {e.task for e in entries}:
             command_line.check_new_file(_figure(arguments.figures, task), "--figures", overwrite=arguments.overwrite)
         command_line.check_writable(arguments.figures, "--figures")
-    images = document.draw_tasks(entries)
-    player = None if arguments.no_animation else document.animate
-    shown = document.policies_section(files, animated=not arguments.no_animation) if files else ""
-    page = document.page(entries, images, seed=arguments.seed, player=player, policies=shown)
-    path.write_text(page, encoding="utf-8")
+    path.write_text(_page(entries, files, arguments), encoding="utf-8")
     print(f"page    {path}")
     if arguments.figures:
-        for task, image in images.items():
+        for task, runs in document.tasks_of(entries).items():
             figure = _figure(arguments.figures, task)
-            figure.write_bytes(image)
+            figure.write_bytes(document.draw_task(runs))
             print(f"figure  {figure}")
+
+
+def _page(entries: Sequence[Entry], files: Sequence[PolicyFile], arguments: argparse.Namespace) -> str:
+    if arguments.no_animation:
+        return document.page(entries, seed=arguments.seed, files=files)
+    from experiments.page import episodes  # imports JAX, which a page without episodes does not need
+
+    total = len(entries) + sum(file.num_policies for file in files)
+    numbers = itertools.count(1)
+    with waiting.progress("playing episodes for the page", "policies") as update:
+        update(0, total)
+
+        def play_run(entry: Entry) -> str:
+            played = episodes.of_run(entry)
+            update(next(numbers), total)
+            return played
+
+        def play_policy(file: PolicyFile, index: int) -> str:
+            played = episodes.of_policy(file, index)
+            update(next(numbers), total)
+            return played
+
+        return document.page(entries, seed=arguments.seed, play_run=play_run, files=files, play_policy=play_policy)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

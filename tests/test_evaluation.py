@@ -95,3 +95,12 @@ def test_what_a_policy_or_an_environment_returns_must_have_the_right_shape() -> 
     ):
         with pytest.raises(AssertionError, match="shape"):
             rollout.rollout(env, apply, params, rollout.init(env, 2, jax.random.key(0)), 3, jax.random.key(1))
+
+
+def test_an_evaluation_tells_how_far_it_is() -> None:
+    told: list[tuple[int, int]] = []
+    evaluate(1, on_progress=lambda done, total: told.append((done, total)))
+    length = Walk().max_episode_steps
+    assert told[-1] == (length, length)
+    assert len(told) > 1
+    assert np.unique(np.diff([0, *(done for done, _ in told)])).size == 1

@@ -9,7 +9,7 @@ import pytest
 
 from ccil_jax.demonstrations import npz
 from ccil_jax.demonstrations.npz import ArchiveError
-from experiments.page import document
+from experiments.page import document, episodes
 from experiments.policies import policy_file
 from experiments.policies.numpy_policy import policies
 
@@ -155,14 +155,14 @@ def test_policies_fit_their_task(tmp_path: Path) -> None:
 
 def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
     """Their returns and costs, 3 +- 1 by hand, and an episode of each; that of an unknown task in the table alone."""
-    episodes = {
+    played = {
         "episode_return": np.array([[2.0, 4.0], [2.0, 4.0]]),
         "episode_cost": np.array([[2.0, 4.0], [5.0, 5.0]]),
     }
-    npz.write(tmp_path / "a.npz", content(**episodes))
+    npz.write(tmp_path / "a.npz", content(**played))
     npz.write(tmp_path / "b.npz", content(metadata={**METADATA, "training": {**METADATA["training"], "task": "a:b"}}))
     files = [policy_file.read(tmp_path / name) for name in ("a.npz", "b.npz")]
-    page = document.page([], {}, policies=document.policies_section(files))
+    page = document.page([], files=files, play_policy=episodes.of_policy)
     assert "<td>malm on Swimmer, seed 4</td><td>3.00 <small>&plusmn; 1.00</small></td>" in page
     assert "<td>5.00 <small>&plusmn; 0.00</small></td><td>3.00</td><td>-</td>" in page
     assert "<td>malm on a:b, seed 7</td><td>-</td>" in page

@@ -1,4 +1,4 @@
-"""The page: self-contained, every seed on it, figures that decode; and the episode that it plays."""
+"""The page: self-contained, every seed on it, figures that decode."""
 
 import base64
 import errno
@@ -19,9 +19,8 @@ from ccil_jax.config import Config
 from ccil_jax.training.progress import Display
 from experiments import benchmark, report
 from experiments.cli.command_line import UsageError
-from experiments.page import document
-from experiments.page.entries import read_entries
-from experiments.policies import evaluating
+from experiments.page import document, plots
+from experiments.page.entries import choose_seed, read_entries
 from experiments.runs import execution, figures, labels, run_folder, summary
 from experiments.runs.metrics_file import MetricsWriter, read_metrics
 from experiments.runs.summary import Reference, aggregate_scores, scores
@@ -121,8 +120,7 @@ class Page(html.parser.HTMLParser):
 
 
 def make_page(folders: Sequence[Path]) -> str:
-    entries = read_entries(folders)
-    return document.page(entries, document.draw_tasks(entries))
+    return document.page(read_entries(folders))
 
 
 def test_page_is_self_contained_and_shows_every_seed(tmp_path: Path) -> None:
@@ -130,18 +128,19 @@ def test_page_is_self_contained_and_shows_every_seed(tmp_path: Path) -> None:
     text = make_page(folders)
     page = Page(text)
     assert page.open == []
-    assert len(page.addresses) == 1
-    assert page.addresses[0].startswith("data:image/png;base64,")
-    image = matplotlib.image.imread(io.BytesIO(base64.b64decode(page.addresses[0].split(",")[1])))
-    assert image.shape[0] > 300
-    assert image.shape[1] > 1000
+    assert len(page.addresses) == 4  # return, cost, cost rate, and return against cost
+    for address in page.addresses:
+        assert address.startswith("data:image/png;base64,")
+        image = matplotlib.image.imread(io.BytesIO(base64.b64decode(address.split(",")[1])))
+        assert image.shape[0] > 300
+        assert image.shape[1] > 600
     assert not re.search(r"https?://", text)
     rows = " | ".join(page.cells)
     assert "60.00 [50.00, 70.00]" in rows  # interquartile mean of 50, 60, 70 and the range that resamples can reach
     assert "malm, seed 2 | 70.00 ± 0.50 | 33.00 ± 0.25 | 70.00 | 0.10 * | 60.00" in rows
     assert "gail, seed 2 | 90.00 ±" in rows
-    assert "expert |  | 100.0 ± 2.00 | 30.00 ± 1.50 |" in rows
-    assert "random policy |  | 0.00 ± - | 1.00 ± - |" in rows
+    assert "expert | 100.0 ± 2.00 | 30.00 ± 1.50 |" in rows
+    assert "random policy | 0.00 ± - | 1.00 ± - |" in rows
     assert text.count("title='beyond the demonstrations&#x27; error'") == 2 + 6  # runs and seeds
     assert "docs/metrics.md" in text
     assert "max_kl | 0.01 | 0.02" in rows
@@ -154,15 +153,15 @@ def test_runs_of_several_tasks_are_also_pooled(tmp_path: Path) -> None:
     page = Page(make_page(folders))
     rows = " | ".join(page.cells)
     assert "malm | 2 | 70.00 [" in rows  # interquartile mean of 50, 60, 70, 70, 80, 90
-    assert len(page.addresses) == 2
+    assert len(page.addresses) == 8
 
 
 def test_a_page_of_an_earlier_versions_run_shows_dashes_for_what_it_lacks(tmp_path: Path) -> None:
     text = make_page([make_run(tmp_path / "a", "malm", num_seeds=2, errors={})])
     rows = " | ".join(Page(text).cells)
-    assert "malm | 2 | 55.00 [-] | 33.00 [-] | 55.00 [-] | 0.10 [-] |" in rows
+    assert "malm | 55.00 [-] | 33.00 [-] | 55.00 [-] | 0.10 [-] | 45.00 [-] | 0.05 [-] | 2 | 30,000" in rows
     assert "malm, seed 1 | 60.00 ± - | 33.00 ± - | 60.00 | 0.10 | 50.00" in rows
-    assert "expert |  | 100.0 ± - | 30.00 ± - |" in rows
+    assert "expert | 100.0 ± - | 30.00 ± - |" in rows
     assert "class=beyond" not in text
 
 
@@ -171,9 +170,9 @@ def test_levels_that_differ_between_runs_have_rows_of_their_own(tmp_path: Path) 
     content = run_folder.read_json(folders[1] / "summary.json")
     run_folder.write_json(folders[1] / "summary.json", content | {"cost_limit": 25.0, "random_cost": 2.0})
     rows = " | ".join(Page(make_page(folders)).cells)
-    assert "random policy of malm |  | 0.00 ± - | 1.00 ± - |" in rows
-    assert "random policy of lgail |  | 0.00 ± - | 2.00 ± - |" in rows
-    assert "cost limit of lgail |  |  | 25.00 |" in rows
+    assert "random policy of malm | 0.00 ± - | 1.00 ± - |" in rows
+    assert "random policy of lgail | 0.00 ± - | 2.00 ± - |" in rows
+    assert "cost limit of lgail |  | 25.00 |" in rows
     assert "cost limit of malm" not in rows
 
 
@@ -206,7 +205,7 @@ def test_names_are_drawn_as_they_are(name: str, tmp_path: Path) -> None:
         drawn, is_mathematics = text._preprocess_math(text.get_text())
         assert not is_mathematics
         assert drawn == expected.replace("\t", "?")
-    assert f"malm ({name}), seed 0" in " | ".join(Page(document.page(entries, {name: b""})).cells)
+    assert f"malm ({name}), seed 0" in " | ".join(Page(document.page(entries)).cells)
 
 
 def test_report_writes_where_it_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,6 +258,41 @@ def test_curves_of_single_seeds_and_of_none_that_is_known() -> None:
     assert figures.png(figure).startswith(b"\x89PNG")
 
 
+def test_return_is_drawn_against_cost(tmp_path: Path) -> None:
+    """Means over seeds and, with its standard errors, the expert; the line is the cost that is allowed."""
+    entries = read_entries([make_run(tmp_path / "a", "malm"), make_run(tmp_path / "b", "gail", level=70.0)])
+    axes = plots.draw_return_against_cost([plots.of_run(e) for e in entries], "x").axes[0]
+    drawn = []
+    for bars in axes.containers:
+        (cost,), (level,) = bars.lines[0].get_data()
+        lengths = [float(np.ptp(line.get_segments()[0], axis=0).max()) / 2 for line in bars.lines[2]]
+        drawn.append((cost, level, *lengths))
+    mean = float(np.sqrt(3)) / 3
+    expected = [(33.0, 60.0, 0.25 * mean, 0.5 * mean), (33.0, 80.0, 0.25 * mean, 0.5 * mean), (30.0, 100.0, 1.5, 2.0)]
+    np.testing.assert_allclose(drawn, expected, rtol=1e-6)
+    assert list(axes.lines[-1].get_xdata()) == [30.0, 30.0]
+    seeds = [np.asarray(line.get_ydata()).tolist() for line in axes.lines if len(line.get_xdata()) == 3]
+    assert seeds == [[50.0, 60.0, 70.0], [70.0, 80.0, 90.0]]
+
+
+def test_what_goes_on_inside_a_method_is_drawn_where_there_is_something(tmp_path: Path) -> None:
+    nan, ones = np.full((3, 2), np.nan), np.ones((3, 2))
+    metrics = {"env_steps": ones, "episode_return": ones, "multiplier": 0 * ones, "meta_gradient": nan}
+    curves = [
+        figures.Curve("gail", {**metrics, "discriminator_accuracy_held_out": ones}, {}, None),
+        figures.Curve("malm", {**metrics, "multiplier": ones}, {}, None),
+    ]
+    panels = [(panel.metric, list(panel.curves)) for panel in figures.inner_panels_of(curves)]
+    assert panels == [("multiplier", [1]), ("discriminator_accuracy_held_out", [0])]
+    folder = make_run(tmp_path / "a", "malm")
+    assert "Inside the methods" not in make_page([folder])
+    metrics = {name: np.vstack([rows, rows]) for name, rows in read_metrics(folder).items()}
+    with MetricsWriter(folder) as writer:
+        writer.begin({**metrics, "multiplier": metrics["env_steps"]})
+    page = Page(make_page([folder]))
+    assert len(page.addresses) == 5
+
+
 def test_cloning_is_drawn_against_its_iterations_beside_runs_that_take_steps(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a", "gail"), make_run(tmp_path / "b", "bc")]
     figure = figures.draw_panels([figures.read_curve(folder) for folder in folders], "Swimmer")
@@ -277,23 +311,14 @@ def test_cloning_is_drawn_against_its_iterations_beside_runs_that_take_steps(tmp
     ]
 
 
-def test_the_episode_shown_is_said_to_be_of_the_best_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from experiments.page import animation
-
+def test_the_episode_shown_is_said_to_be_of_the_best_seed(tmp_path: Path) -> None:
     folders = [make_run(tmp_path / "a/run", "malm"), make_run(tmp_path / "b/run", "malm", num_seeds=1)]
     content = run_folder.read_json(folders[0] / "summary.json")
     content["per_seed"][2]["episode_return"] = None  # was not finite
     run_folder.write_json(folders[0] / "summary.json", content)
-    for folder in folders:
-        (folder / "checkpoints").mkdir()
-    calls: list[tuple[Any, ...]] = []
-    monkeypatch.setattr(evaluating, "load", lambda run: run)
-    monkeypatch.setattr(animation, "play", lambda loaded, *more: calls.append(more))
-    for entry in read_entries(folders):
-        document.animate(entry)
-    assert calls == [
-        (1, "episode-0", "One episode of malm (a/run), seed 1, which has the highest mean return of 3 seeds."),
-        (0, "episode-1", "One episode of malm (b/run), seed 0."),
+    assert [choose_seed(entry) for entry in read_entries(folders)] == [
+        (1, "One episode of malm (a/run), seed 1, which has the highest mean return of 3 seeds."),
+        (0, "One episode of malm (b/run), seed 0."),
     ]
 
 
@@ -354,29 +379,6 @@ def test_the_summary_is_the_last_file_of_a_run(
     assert content["aggregate"]["episode_cost"]["low"] is None
 
 
-def test_poses_are_drawn_from_the_engine() -> None:
-    import envs
-    from experiments.page.animation import record_poses, to_html
-
-    class Still:
-        """A policy that does nothing."""
-
-        def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
-            return np.zeros(6)
-
-    env: Any = envs.make("HalfCheetah", physics="native")
-    poses = record_poses(env, Still(), num_steps=20)  # type: ignore[arg-type]
-    assert poses.frames.shape == (10, 8, 4)
-    assert poses.seconds_per_frame == pytest.approx(0.1)
-    lengths = np.hypot(*(poses.frames[:, :, 2:] - poses.frames[:, :, :2]).transpose(2, 0, 1))
-    np.testing.assert_allclose(lengths, np.tile(lengths[0], (10, 1)), atol=1e-6)  # bones do not stretch
-    np.testing.assert_allclose(lengths[0, 0], 1.0, atol=1e-6)  # the torso's capsule, 2 x 0.5 m
-    assert -0.2 < poses.frames[:, :, [1, 3]].min() < 0.3  # it lies on the floor
-    text = to_html(poses, "episode", "a <cheetah>.")
-    assert "a &lt;cheetah&gt;. Its first 20 steps are played;" in text
-    assert text.count("<canvas") == 1
-
-
 def test_benchmark_settings_and_table(capsys: pytest.CaptureFixture[str]) -> None:
     parser = benchmark.make_parser()
     arguments = parser.parse_args(["--tasks", "Swimmer", "Ant", "--num_seeds", "1", "2", "--quick"])
@@ -411,31 +413,6 @@ def test_benchmark_measures_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert row["training_to_physics"] == pytest.approx(ratio)
     assert row["compile_seconds"] > 0
     assert row["peak_memory"] > 100
-
-
-def test_a_safety_gym_episode_is_drawn_from_above() -> None:
-    import envs
-    from experiments.page import top_down
-
-    class Ahead:
-        """Full thrust."""
-
-        def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
-            return np.array([1.0, 0.2])
-
-    env: Any = envs.make("PointGoal1", physics="native")
-    episode = top_down.record(env, Ahead(), num_steps=30)  # type: ignore[arg-type]
-    assert episode.robot.shape == (31, 2)
-    assert {name: places.shape for name, places in episode.objects.items()} == {
-        "goal": (31, 1, 2),
-        "hazards": (31, 8, 2),
-        "vases": (31, 1, 2),
-    }
-    assert np.hypot(*np.diff(episode.robot, axis=0).T).max() > 1e-3
-    axes = top_down.draw(env, episode).axes[0]
-    circles = [patch for patch in axes.patches if patch.get_gid() is None and hasattr(patch, "radius")]
-    assert len(circles) == 8 + 1 + episode.met.sum()
-    assert "PointGoal1: 30 steps" in axes.get_title(loc="left")
 
 
 def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -477,7 +454,7 @@ def test_a_run_that_goes_on_is_not_reported_as_finished(tmp_path: Path, capsys: 
 def test_settings_that_a_run_does_not_use_are_shown_as_a_dash(tmp_path: Path) -> None:
     runs = [make_run(tmp_path / method, method) for method in ("bc", "gail")]
     entries = read_entries(runs)
-    page = document.page(entries, document.draw_tasks(entries))
+    page = document.page(entries)
     assert "<tr><td>actor_learning_rate</td><td>0.001</td><td>-</td></tr>" in page
     assert "<tr><td>env_steps</td><td>-</td><td>30000</td></tr>" in page
     assert "<td>gate</td>" not in page

@@ -46,7 +46,10 @@ class Trajectories:
     valid: jax.Array  # [T, N] bool
 
 
+_PORTIONS = 10  # into which an evaluation is divided, about, to tell how far it is
 Act = Callable[[jax.Array, jax.Array], jax.Array]  # obs [N, obs_dim], key -> action [N, action_dim]
+Playing = tuple[State, jax.Array]  # N episodes between two steps, and which of them still go on, [N] bool
+Charged = tuple[jax.Array, jax.Array, jax.Array]  # reward, cost and `valid` of `Trajectories`
 
 
 @full_precision
@@ -57,14 +60,26 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
         ValueError: the policy returns actions of another shape than the environment takes.
         AssertionError: the environment returns arrays of other shapes than it should.
     """
+    start, keys = _begin(env, num_episodes, key)
+    return _play_on(env, policy, start, keys)[1]
+
+
+def _begin(env: Environment, num_episodes: int, key: jax.Array) -> tuple[Playing, jax.Array]:
+    """The start of `num_episodes` episodes, and the random key of each step, [max_episode_steps]."""
     reset_key, key = jax.random.split(key)
     start = jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes))
+    return (start, jnp.ones(num_episodes, bool)), jax.random.split(key, env.max_episode_steps)
 
-    def step(carry: tuple[State, jax.Array], key: jax.Array) -> tuple[tuple[State, jax.Array], Trajectories]:
+
+@full_precision
+def _play_on(env: Environment, policy: Act, playing: Playing, keys: jax.Array) -> tuple[Playing, Trajectories]:
+    """As many further steps of all episodes as there are keys."""
+
+    def step(carry: Playing, key: jax.Array) -> tuple[Playing, Trajectories]:
         state, running = carry
         action = jax.vmap(functools.partial(executed, env))(policy(state.obs, key))
         stepped = jax.vmap(env.step)(state, action)
-        check_step(env, stepped, num_episodes)
+        check_step(env, stepped, len(running))
         steps = Trajectories(
             obs=state.obs,
             next_obs=stepped.obs,
@@ -77,10 +92,7 @@ def run_episodes(env: Environment, policy: Act, num_episodes: int, key: jax.Arra
         )
         return (stepped, running & ~stepped.done), steps
 
-    running = jnp.ones(num_episodes, bool)
-    keys = jax.random.split(key, env.max_episode_steps)
-    _, trajectories = jax.lax.scan(step, (start, running), keys)
-    return trajectories
+    return jax.lax.scan(step, playing, keys)
 
 
 def _learnt(config: Config, env: Environment, actor: Actor, deterministic: bool, policy: Policy | None) -> Act:
@@ -108,12 +120,17 @@ def _uniform(env: Environment) -> Act:
     return policy_act
 
 
-def _totals(steps: Trajectories) -> Evaluation:
+def _totals(steps: Charged) -> Evaluation:
+    reward, cost, valid = steps
     return Evaluation(
-        episode_return=jnp.sum(jnp.where(steps.valid, steps.reward, 0.0), axis=0),
-        episode_cost=jnp.sum(jnp.where(steps.valid, steps.cost, 0.0), axis=0),
-        episode_length=jnp.sum(steps.valid, axis=0),
+        episode_return=jnp.sum(jnp.where(valid, reward, 0.0), axis=0),
+        episode_cost=jnp.sum(jnp.where(valid, cost, 0.0), axis=0),
+        episode_length=jnp.sum(valid, axis=0),
     )
+
+
+def _charged(steps: Trajectories) -> Charged:
+    return steps.reward, steps.cost, steps.valid
 
 
 @jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose
@@ -127,6 +144,7 @@ def evaluate(
     deterministic: bool = False,
     draws: Sequence[int] | None = None,
     policy: Policy | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Evaluation:
     """Return, cost and length of `num_episodes` new episodes of every policy in `actor`.
 
@@ -143,6 +161,7 @@ def evaluate(
             layouts and noise, which makes comparisons between them paired. None stands for 0 to S - 1: then the means
             of the policies are independent.
         policy: the network that was given to `make_agent`; None for the method's own.
+        on_progress: is told now and then how many of how many steps are done.
 
     Returns:
         NumPy arrays [S, num_episodes].
@@ -153,12 +172,24 @@ def evaluate(
     if num_episodes < 1:
         raise ValueError(f"num_episodes {num_episodes}: must be at least 1")
     keys = _keys(seed, range(_num_rows(actor)) if draws is None else draws)
+    actor, keys = _placed((actor, keys))
 
-    def run(runs: tuple[Actor, jax.Array]) -> Evaluation:
-        actor, key = runs
-        return _totals(run_episodes(env, _learnt(config, env, actor, deterministic, policy), num_episodes, key))
+    def play_on(runs: tuple[Actor, Playing, jax.Array]) -> tuple[Playing, Charged]:
+        actor, playing, keys = runs
+        playing, steps = _play_on(env, _learnt(config, env, actor, deterministic, policy), playing, keys)
+        return playing, _charged(steps)
 
-    return jax.tree.map(np.asarray, _spread(run, (actor, keys)))
+    playing, step_keys = _spread(lambda key: _begin(env, num_episodes, key), keys)
+    advance, parts = _compiled(play_on, len(keys)), list[Charged]()
+    total = env.max_episode_steps
+    portion = next(n for n in range(-(-total // _PORTIONS), total + 1) if total % n == 0)  # one program fits them all
+    for done in range(0, total, portion):
+        playing, steps = advance((actor, playing, step_keys[:, done : done + portion]))
+        parts.append(jax.device_get(steps))
+        if on_progress is not None:
+            on_progress(done + portion, total)
+    steps = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(_totals))(steps))
 
 
 @jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose
@@ -168,7 +199,7 @@ def random_policy(env: Environment, *, num_episodes: int = 50, seed: int = 0) ->
     padded = -(-num_episodes // num_devices) * num_devices  # rounded up, so that each device has as many
 
     def run(key: jax.Array) -> Evaluation:
-        return _totals(run_episodes(env, _uniform(env), 1, key))
+        return _totals(_charged(run_episodes(env, _uniform(env), 1, key)))
 
     return jax.tree.map(lambda rows: np.asarray(rows)[:num_episodes].T, _spread(run, _keys(seed, range(padded))))
 
@@ -186,10 +217,18 @@ def _num_rows(tree: PyTree) -> int:
 
 def _spread(run: Callable[[Any], Any], runs: PyTree) -> Any:
     """`run` of every row of `runs` ([R]-leading), vmapped; the rows are divided among the local devices."""
-    mesh = run_mesh(_num_rows(runs))
+    return _compiled(run, _num_rows(runs))(_placed(runs))
+
+
+def _compiled(run: Callable[[Any], Any], num_runs: int) -> Callable[[PyTree], Any]:
     by_run = PartitionSpec("runs")
-    shared = jax.shard_map(jax.vmap(run), mesh=mesh, in_specs=by_run, out_specs=by_run, check_vma=False)
-    return jax.jit(shared)(jax.device_put(runs, NamedSharding(mesh, by_run)))
+    vmapped = jax.vmap(run)
+    mesh = run_mesh(num_runs)
+    return jax.jit(jax.shard_map(vmapped, mesh=mesh, in_specs=by_run, out_specs=by_run, check_vma=False))
+
+
+def _placed(runs: PyTree) -> PyTree:
+    return jax.device_put(runs, NamedSharding(run_mesh(_num_rows(runs)), PartitionSpec("runs")))
 
 
 @jax.transfer_guard("allow")  # arrays travel between host and device before and after the compiled program on purpose

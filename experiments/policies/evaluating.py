@@ -1,7 +1,7 @@
 """Evaluates policies, of a run or of a file: they play fresh episodes, in our simulator or in the original one."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +88,13 @@ def load_file(file: PolicyFile, task: TaskInfo) -> Loaded:
         UserError: the task cannot be built, or the policies do not fit it.
     """
     training = file.training
-    env = build_environment(task.name, training["physics"], training["env_options"])
+    return on_environment(file, task, build_environment(task.name, training["physics"], training["env_options"]))
+
+
+def on_environment(file: PolicyFile, task: TaskInfo, env: Any) -> Loaded:
+    """The policies of a file on `env`, an environment of `task`. Raises `UserError` where they do not fit it."""
     file.check_sizes(env.obs_dim, env.action_dim)
+    training = file.training
     return Loaded(
         source=file.path.resolve(),
         task=task,
@@ -102,8 +107,12 @@ def load_file(file: PolicyFile, task: TaskInfo) -> Loaded:
     )
 
 
-def play(loaded: Loaded, settings: Settings) -> Any:
-    """Plays the episodes: `episode_return`, `episode_cost` and `episode_length`, [num_seeds, num_episodes] each."""
+def play(loaded: Loaded, settings: Settings, on_progress: Callable[[int, int], None] | None = None) -> Any:
+    """Plays the episodes: `episode_return`, `episode_cost` and `episode_length`, [num_seeds, num_episodes] each.
+
+    `on_progress` is told now and then how much of how much is done: steps of all episodes together in our simulator,
+    episodes in the original one.
+    """
     from ccil_jax.acting import evaluation
     from experiments.policies import original_simulator
 
@@ -112,6 +121,7 @@ def play(loaded: Loaded, settings: Settings) -> Any:
         "seed": settings.seed,
         "deterministic": settings.deterministic,
         "draws": [0] * loaded.num_policies if settings.shared_episodes else None,
+        "on_progress": on_progress,
     }
     if settings.simulator == "ours":
         return evaluation.evaluate(loaded.config, loaded.actor, loaded.env, **of_episodes)

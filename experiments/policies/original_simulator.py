@@ -4,7 +4,7 @@ Reward and cost are computed by the task's rule (`envs.locomotion`) from the rew
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -40,10 +40,11 @@ def evaluate(
     deterministic: bool = False,
     draws: Sequence[int] | None = None,
     contact_cost: bool = True,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Totals:
     """The same as `ccil_jax.acting.evaluation.evaluate`, in gymnasium's simulator. `actor` is [num_seeds]-leading.
 
-    `contact_cost` is the option of that name with which `env` was made.
+    `contact_cost` is the option of that name with which `env` was made. `on_progress` counts episodes.
     """
     simulator, learnt, results = make_simulator(env), policies(config, actor, env), []
     for draw, policy in zip(range(len(learnt)) if draws is None else draws, learnt, strict=True):
@@ -52,6 +53,8 @@ def evaluate(
             (start,) = np.random.SeedSequence([seed, draw, episode]).generate_state(1)
             steps = run_episode(simulator, policy, random, int(start), deterministic)
             results.append(score(env, steps, contact_cost))
+            if on_progress is not None:
+                on_progress(len(results), len(learnt) * num_episodes)
     simulator.close()
     totals = np.array(results).reshape(len(learnt), num_episodes, 3)
     return Totals(totals[..., 0], totals[..., 1], totals[..., 2])

@@ -29,6 +29,11 @@ CLONING_PANELS = (  # of a method that does not act while it learns
     ("loss", "Loss, nats"),
     ("held_out_loss", "Loss on held-out steps, nats"),
 )
+INNER_PANELS = (  # of what goes on inside a method
+    ("multiplier", "Multiplier"),
+    ("meta_gradient", "Meta-gradient of the multiplier"),
+    ("discriminator_accuracy_held_out", "Discriminator's accuracy, held-out"),
+)
 _DEMONSTRATIONS, _ERROR, _LIMIT = _LEVEL_LABELS = ("mean of the demonstrations", "its standard error", "cost limit")
 _MAX_POINTS = 100  # of a curve. Few episodes end in an iteration, so that single iterations scatter too much
 COLORS = ("#0b6e99", "#d1495b", "#6a994e", "#e09f3e", "#7b5ea7", "#3d405b", "#00a5a5", "#a44a3f")
@@ -49,6 +54,8 @@ STYLE: Any = {
     "ytick.color": "#4a4f57",
     "legend.frameon": False,
 }
+SMALL = (4.6, 3.1)  # inches, of a single panel; with the larger letters it can be read on a telephone
+SMALL_STYLE: Any = {**STYLE, "font.size": 11.5, "axes.titlesize": 12.5}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,15 +133,35 @@ def panels_of(curves: Sequence[Curve]) -> list[Panel]:
     usual = PANELS + CLONING_PANELS
     strange = [c.metrics for c in curves if not any(metric in c.metrics for metric, _ in usual)]
     others = dict.fromkeys(name for metrics in strange for name in metrics if name != "env_steps")
+    return _panels(dict(enumerate(curves)), [*usual, *((name, name) for name in others)])
+
+
+def inner_panels_of(curves: Sequence[Curve]) -> list[Panel]:
+    """The panels of INNER_PANELS, with the curves that are not zero all along, as without a multiplier."""
+
+    def has(curve: Curve, metric: str) -> bool:
+        return bool(np.nan_to_num(curve.metrics.get(metric, np.zeros(1))).any())
+
+    panels = [_panels({i: c for i, c in enumerate(curves) if has(c, row[0])}, [row]) for row in INNER_PANELS]
+    return [panel for found in panels for panel in found]
+
+
+def _panels(curves: Mapping[int, Curve], titles: Sequence[tuple[str, str]]) -> list[Panel]:
     found = []
-    for metric, title in (*usual, *((name, name) for name in others)):
+    for metric, title in titles:
         for cloning in (False, True):
-            own = {
-                i: c for i, c in enumerate(curves) if metric in c.metrics and (c.steps_per_iteration == 0) is cloning
-            }
+            own = {i: c for i, c in curves.items() if metric in c.metrics and (c.steps_per_iteration == 0) is cloning}
             if own:
                 found.append(Panel(metric, title, own, cloning))
     return found
+
+
+def draw_panel(panel: Panel) -> Figure:
+    """One panel without a legend, for pages that put panels beside or below each other and have one legend for all."""
+    with mpl.rc_context(SMALL_STYLE):
+        figure = Figure(figsize=SMALL, dpi=150, layout="constrained")
+        _draw_panel(figure.subplots(), panel)
+    return figure
 
 
 def draw_panels(curves: Sequence[Curve], task: str, names: Sequence[str] | None = None) -> Figure:
@@ -184,6 +211,9 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Any]:
         for i, curve in panel.curves.items()
     }
     entries |= _draw_levels(axes, list(panel.curves.values()), panel.metric)
+    if all(np.isnan(curve.metrics[panel.metric]).all() for curve in panel.curves.values()):
+        axes.set_xticks([])
+        axes.text(0.5, 0.2, "not known yet", transform=axes.transAxes, ha="center", color="#4a4f57")
     axes.set_title(literal(panel.title))
     if panel.cloning:
         axes.set_xlabel(" or ".join(dict.fromkeys(curve.iteration for curve in panel.curves.values())))
