@@ -18,11 +18,11 @@ from envs.safety_gym.tasks import ARENA, ObjectKind
 from experiments.policies.numpy_policy import NumpyPolicy
 from experiments.runs import figures
 
-_COLORS = {
+COLORS = {  # of the kinds of objects
     "hazards": "#3f6fb5",
     "goal": "#6a994e",
     "vases": "#00a5a5",
-    "buttons": "#e09f3e",
+    "buttons": "#e6c229",
     "gremlins": "#7b5ea7",
     "pillars": "#8a8f98",
     "push_box": "#a44a3f",
@@ -97,7 +97,7 @@ def _draw_arena(axes: Axes) -> None:
 
 def _draw_kind(axes: Axes, kind: ObjectKind, episode: Episode) -> None:
     """Draws where the objects of a kind start and, as thin lines, the paths of those that can move."""
-    color, places = _COLORS[kind.name], episode.objects[kind.name]
+    color, places = COLORS[kind.name], episode.objects[kind.name]
     label: str | None = kind.name.replace("_", " ")
     if kind.name == "goal":
         turns = np.flatnonzero(np.concatenate([[True], episode.met]))
