@@ -219,6 +219,7 @@ def own_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
         yield tmp_path
 
 
+@pytest.mark.slow  # `test_user_tasks.py` does the same with another task, in more ways
 def test_a_task_in_a_file_is_trained_by_the_commands_of_the_page(own_tasks: Path) -> None:
     launchers = {"experiments.expert": expert, "experiments.train": train}
     of_page = [c.words for c in commands() if c.page == "docs/extending.md" and "my_tasks:Cart" in c.words]
