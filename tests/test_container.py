@@ -75,22 +75,22 @@ def test_its_python_is_one_that_the_package_is_tested_on() -> None:
 
 @pytest.mark.slow  # installs the package with all that it needs
 def test_its_first_stage_installs_the_command_and_the_command_trains(tmp_path: Path) -> None:
-    """The steps as a script, with folders of our own for /source, /opt and /runs, and a home that cannot be written."""
+    """The steps as a script, in folders of our own, with a home that cannot be written to."""
     source, runs = tmp_path / "source", tmp_path / "runs"
     for path in filter(is_sent, tracked()):
         (source / path).parent.mkdir(parents=True, exist_ok=True)
         (source / path).write_bytes((ROOT / path).read_bytes())
     runs.mkdir()
-    places = {"/source": str(source), "/opt": str(tmp_path / "opt"), "/runs": str(runs)}
+    places = {"/source": str(source), "/venv": str(tmp_path / "venv"), "/runs": str(runs)}
 
     def here(text: str) -> str:
-        return re.sub(r"/source|/opt|/runs", lambda found: places[found[0]], text)
+        return re.sub(r"/source|/venv|/runs", lambda found: places[found[0]], text)
 
     install = next(rest for word, rest in STEPS if word == "RUN")
     python = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     subprocess.run(["bash", "-euc", here(install)], env=python, check=True, cwd=tmp_path)
     settings = {name: here(value) for name, value in environment().items()}
-    settings |= {"PATH": f"{tmp_path}/opt/ccil/bin:{os.environ['PATH']}", "HOME": "/nonexistent"}
+    settings |= {"PATH": f"{tmp_path}/venv/bin:{os.environ['PATH']}", "HOME": "/nonexistent"}
     given = "train --method malm --env Swimmer --preset tiny --num-seeds 1 --eval-episodes 2 --out first"
     subprocess.run([*json.loads(only("ENTRYPOINT")), *given.split()], env=settings, check=True, cwd=runs)
     assert (runs / "first" / "summary.json").is_file()
