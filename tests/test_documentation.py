@@ -1,5 +1,6 @@
 """The pages: their links lead somewhere, and the README stays what is read in two minutes."""
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -7,7 +8,9 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
+from PIL import Image
 
 from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
@@ -61,6 +64,27 @@ def test_the_table_of_tasks_is_that_of_the_registry() -> None:
     found = [(name, *map(int, numbers)) for name, *numbers in rows]
     built_in = [task for task in TASKS.values() if task.original_package]  # other tests register tasks of their own
     assert found == [(task.name, task.obs_dim, task.action_dim, task.cost_limit) for task in built_in]
+
+
+def test_every_task_has_a_picture_on_the_page() -> None:
+    text = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8")
+    built_in = [task.name for task in TASKS.values() if task.original_package]
+    assert sorted(re.findall(r"!\[(\w+)\]\(figures/tasks/\1\.png\)", text)) == sorted(built_in)
+    assert sum(path.stat().st_size for path in (ROOT / "docs" / "figures" / "tasks").iterdir()) < 400_000
+
+
+def test_the_pictures_are_of_the_tasks_as_they_are() -> None:
+    """Drawn anew, one is the same but for the colours that a small file has."""
+    script = ROOT / "docs" / "figures" / "make_tasks.py"
+    spec = importlib.util.spec_from_file_location("make_tasks", script)
+    assert spec and spec.loader
+    make_tasks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make_tasks)
+    with Image.open(make_tasks.FOLDER / "HalfCheetah.png") as shipped:
+        kept = np.asarray(shipped.convert("RGB"), float)
+    drawn = np.asarray(make_tasks.draw("HalfCheetah"), float)
+    assert np.abs(drawn - kept).mean() < 1.0
+    assert np.abs(drawn - drawn[0, 0]).mean() > 10.0  # it is not all sky
 
 
 def test_every_metric_is_explained() -> None:

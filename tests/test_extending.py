@@ -2,6 +2,8 @@
 
 import re
 import sys
+import types
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +42,10 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patched, quick_compilation():
         patched.chdir(tmp_path_factory.mktemp("page"))
         for block in blocks:
-            exec(compile(block, str(PAGE), "exec"), namespace)  # noqa: S102  (the page is ours)
+            with warnings.catch_warnings():
+                if "import brax" in block:  # which warns of itself and of what it imports
+                    warnings.simplefilter("ignore")
+                exec(compile(block, str(PAGE), "exec"), namespace)  # noqa: S102  (the page is ours)
         yield namespace
     registry._tasks.clear()
     registry._tasks.update(kept["tasks"])
@@ -53,7 +58,32 @@ def test_the_tasks_keep_their_promises(names: dict[str, Any]) -> None:
     check_environment(names["env"])
     check_environment(names["careful"])
     check_environment(names["balancing"])
+    check_environment(names["sliding"])
     assert envs.TASKS["Cart"].cost_limit == 5.0
+
+
+def test_the_puck_pays_where_it_is_faster_than_a_metre_a_second(names: dict[str, Any]) -> None:
+    """In the page's own words, from the places where the engine has it."""
+    env = names["sliding"]
+    step, state = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(0))
+    costs = []
+    for _ in range(30):
+        before, state = state.physics.qpos, step(state, jnp.array([1.0, 0.5]))
+        velocity = (state.physics.qpos - before) / env.dt
+        np.testing.assert_allclose(state.reward, velocity[0], rtol=1e-5)
+        assert state.cost == float(np.linalg.norm(velocity) > 1.0)
+        costs.append(float(state.cost))
+    assert set(costs) == {0.0, 1.0}
+    assert state.obs.shape == (env.obs_dim,) == (2,)
+
+
+@pytest.mark.filterwarnings("ignore:Accessing `ncon`:DeprecationWarning")  # Brax's own use of MJX
+def test_an_environment_of_brax_has_the_cost_of_the_page(names: dict[str, Any]) -> None:
+    env = names["pendulum_of_brax"]
+    state = jax.eval_shape(env.step, jax.eval_shape(env.reset, jax.random.key(0)), jnp.zeros(1))
+    assert (state.cost.shape, state.obs.shape) == ((), (4,))
+    shown = [types.SimpleNamespace(obs=jnp.array([place, 0.0, 0.0, 0.0])) for place in (0.05, -0.2)]
+    assert [float(names["off_centre"](None, jnp.zeros(1), after)) for after in shown] == [0.0, 1.0]
 
 
 def test_the_page_trains_its_own_method(names: dict[str, Any]) -> None:

@@ -23,7 +23,7 @@ COLORS = {  # by kind; the last two digits are the opacity
     "hazards": "#3f6fb573",
     "goal": "#6a994e73",
     "vases": "#00a5a5b0",
-    "buttons": "#e09f3eb0",
+    "buttons": "#e6c229b0",
     "gremlins": "#7b5ea7b0",
     "pillars": "#8a8f98c0",
     "push_box": "#a44a3fb0",
