@@ -19,6 +19,10 @@ def name_of(path: Path) -> str:
     return path.relative_to(FOLDER).as_posix()
 
 
+def test_every_demonstrator_is_there_too() -> None:
+    assert [path.name for path in DEMONSTRATIONS] == [path.name for path in EXPERTS]
+
+
 def test_every_file_has_the_checksum_of_the_list() -> None:
     """`sha256sum --check SHA256SUMS` in the folder says the same."""
     lines = (FOLDER / "SHA256SUMS").read_text(encoding="utf-8").splitlines()
@@ -36,8 +40,8 @@ def test_demonstrations_are_of_their_task_and_say_where_they_are_from(path: Path
     assert facts["task"] == path.stem
     assert demonstrations.num_episodes == 10
     assert np.isfinite(demonstrations.obs).all()
-    if (FOLDER / "experts" / path.name).exists():  # the others were recorded before experts were shipped
-        assert "-dirty" not in facts["git_commit"]
+    assert demonstrations.final_obs is not None
+    assert "-dirty" not in facts["git_commit"]
     assert facts["evaluation"]["episode_cost"] <= facts["cost_limit"] <= (TASKS[path.stem].cost_limit or np.inf)
 
 
