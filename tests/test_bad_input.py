@@ -183,12 +183,18 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         RECORD,
         "--record: no seed keeps the cost limit 20 (seed 0: 21, seed 1: 30.5); choose one by --seed-index N",
     ),
-    "record what": (("evaluate", "done", "--seed-index", "1"), "--seed-index 1: says what to record or export; add"),
+    "record what": (
+        ("evaluate", "done", "--seed-index", "1"),
+        "--seed-index 1: says what to record, export or show; add",
+    ),
     "record how many": (("evaluate", "done", "--num-trajectories", "3"), "--num-trajectories 3: says what to record"),
     "record the mode": ((*RECORD, "--deterministic"), "--deterministic: demonstrations are recorded from sampled"),
     "record elsewhere": ((*RECORD, "--simulator", "original"), "--simulator original: demonstrations are recorded in"),
     "record too early": (("evaluate", "half", "--record", "new.npz"), "the run in half is not finished; continue it"),
-    "overwrite nothing": (("evaluate", "done", "--overwrite"), "--overwrite: for files of --export and --record"),
+    "overwrite nothing": (
+        ("evaluate", "done", "--overwrite"),
+        "--overwrite: for files of --export, --record and --video",
+    ),
     "report on what": (("report",), "RUN_DIR: give at least one folder of a run, or --policies FILE.npz"),
     "report on no policy": (
         ("report", "--policies", "good.npz"),
