@@ -133,7 +133,7 @@ def test_a_demonstration_is_shown_where_its_observations_say() -> None:
 def test_the_expert_is_shown_where_it_is_at_hand(
     task: str, change: str | None, title: str | None, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where no title is expected, the policy of the task's expert is not shipped, as is so for tasks without an expert."""
+    """Where no title is expected, no policy of the task's expert is shipped."""
     path = SHIPPED / f"{task}.npz"
     facts = {"file": str(path), "sha256": file_sha256(path)}
     if change:
