@@ -63,7 +63,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     # No discriminator has to follow the policy, so an iteration has one larger batch and a wider trust region. What
     # matters most is the horizon: with a discount of 0.99 Hopper learns to run, and to fall after 500 steps. The gap
-    # relative to the limit and cost advantages of unit deviation bring the multiplier's rates of the tasks together, yet
+    # relative to the limit and cost advantages of unit deviation bring the multiplier's rates of the tasks together, if
     # not to one number: docs/tasks.md says where a slower one, or a first multiplier above 0, is worth most.
     "expert": {
         "env_steps": 3_000_000,
