@@ -154,7 +154,10 @@ def test_policies_fit_their_task(tmp_path: Path) -> None:
 
 
 def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
-    """Their returns and costs, 3 +- 1 by hand, and an episode of each; that of an unknown task in the table alone."""
+    """Their returns and costs, 3 +- 1 by hand, and an episode of each beside one of the task's expert.
+
+    That of an unknown task is in the table alone.
+    """
     played = {
         "episode_return": np.array([[2.0, 4.0], [2.0, 4.0]]),
         "episode_cost": np.array([[2.0, 4.0], [5.0, 5.0]]),
@@ -166,4 +169,5 @@ def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
     assert "<td>malm on Swimmer, seed 4</td><td>3.00 <small>&plusmn; 1.00</small></td>" in page
     assert "<td>5.00 <small>&plusmn; 0.00</small></td><td>3.00</td><td>-</td>" in page
     assert "<td>malm on a:b, seed 7</td><td>-</td>" in page
-    assert page.count("<canvas") == 2
+    assert page.count("<canvas") == 4
+    assert page.count("the shipped expert</") == 2

@@ -365,7 +365,7 @@ def test_sizes_that_do_not_fit_leave_no_run_behind(folder: Path, capsys: pytest.
 
     found = load_demonstrations(folder / "expert.npz")
     wide = np.hstack([found.obs, found.obs])
-    save_demonstrations("wide.npz", dataclasses.replace(found, obs=wide))
+    save_demonstrations("wide.npz", dataclasses.replace(found, obs=wide, final_obs=None))
     given = ["--env", TASK, "--method", "gail", "--demos", "wide.npz", "--out", "wide", *TINY]
     with pytest.raises(SystemExit):
         train.main(given)
