@@ -10,6 +10,8 @@ import pytest
 import envs
 from envs.testing import check_environment
 
+pytestmark = pytest.mark.once
+
 LOCOMOTION = [name for name, info in envs.TASKS.items() if info.family == "locomotion"]
 
 

@@ -17,6 +17,8 @@ from tests import faults
 from tests.faults import Suite
 from tests.probe_envs import Walk, quick_compilation, walk_config
 
+pytestmark = pytest.mark.once
+
 SIMPLE = "gail"  # the quickest to compile
 
 

@@ -10,6 +10,8 @@ import pytest
 import envs
 from envs.base import State
 
+pytestmark = pytest.mark.once
+
 NUM_ENVS = 8
 
 

@@ -18,6 +18,8 @@ from envs.base import Mirror, mirror_of
 from envs.safety_gym.environment import SafetyGym
 from envs.safety_gym.robots import ROBOTS
 
+pytestmark = pytest.mark.once
+
 SYMMETRIC = ("PointGoal1", "CarGoal1", "DoggoGoal1", "PointPush1", "CarPush1")
 WORLD = np.array([-1.0, 1.0, 1.0])  # x changes its sign, so that the magnetic field, which points along -y, stays
 HALF_TURN = np.array([0.0, 0.0, 0.0, 1.0])  # about the vertical, as a quaternion

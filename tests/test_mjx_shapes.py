@@ -11,6 +11,8 @@ from envs.physics.mjx import import_mjx, read
 from envs.safety_gym import scene
 from envs.safety_gym.tasks import TABLE
 
+pytestmark = pytest.mark.once
+
 GEOM = mujoco.mjtGeom
 NUM_POSES = 256
 Geom = tuple[Any, list[float]]  # type and size

@@ -13,6 +13,8 @@ import pytest
 
 from tests.test_documentation import ROOT
 
+pytestmark = pytest.mark.once
+
 FOLDER = ROOT / "docs" / "notebooks"
 # In the place of the cell with the tag `parameters`. A warning is an error, as in all tests, and compilation is quick.
 FIRST = """

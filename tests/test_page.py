@@ -15,6 +15,8 @@ from experiments.page.entries import read_entries
 from tests.films import make_film
 from tests.test_report import make_run
 
+pytestmark = pytest.mark.once
+
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 

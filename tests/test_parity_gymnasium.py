@@ -11,6 +11,8 @@ import scipy.stats
 
 import envs
 
+pytestmark = pytest.mark.once
+
 pytest.importorskip("imageio", reason="gymnasium's MuJoCo tasks import it")
 gymnasium = pytest.importorskip("gymnasium")
 

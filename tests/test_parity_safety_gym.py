@@ -22,6 +22,8 @@ from envs.safety_gym.environment import SafetyGym, World
 from envs.safety_gym.tasks import TABLE
 from envs.safety_gym.terms import AIMS, COSTS
 
+pytestmark = pytest.mark.once
+
 FOLDER = Path(__file__).parent / "golden" / "safety_gym"
 LAST_DISTANCES = {  # aim -> our name of a distance -> the recorder's
     "goal": {"goal_distance": "last_dist_goal"},

@@ -21,6 +21,8 @@ from envs.safety_gym.environment import SafetyGym
 from envs.safety_gym.tasks import TABLE
 from tests.golden.wanderer import act, plan
 
+pytestmark = pytest.mark.once
+
 FOLDER = Path(__file__).parent / "golden" / "safety_gym" / "distributions"
 KINDS = {"vase": "vases", "gremlin": "gremlins", "button": "buttons", "pillar": "pillars", "box": "push_box"}
 SETTLED = 1e-3  # m

@@ -27,6 +27,8 @@ from envs.physics.mjx import import_mjx
 from envs.physics.mjx_patch import searches_that_end
 from envs.physics.native import NativePhysics
 
+pytestmark = pytest.mark.once
+
 SUBNORMAL = [1e-38, 1e-45, -1e-45, 1.1754942e-38, 2e-39]  # in float32
 SPECIAL = [0.0, -0.0, 1.0, -1.5, 3.1415927, *SUBNORMAL, 3.4e38, -3.4e38, np.inf, -np.inf]
 

@@ -402,6 +402,7 @@ def test_benchmark_settings_and_table(capsys: pytest.CaptureFixture[str]) -> Non
         assert text in out
 
 
+@pytest.mark.once
 def test_benchmark_measures_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")  # its speed does not matter here
     tiny = ["--tasks", "Swimmer", "--num-seeds", "2", "--num-envs", "4", "--preset", "tiny", "--quick"]

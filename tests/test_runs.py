@@ -262,6 +262,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("method", ["trpo", pytest.param("malm", marks=pytest.mark.slow)])
 def test_devices_share_runs_without_a_word(method: str) -> None:
     """Four CPU devices: nothing travels between them; in turn, a run has the bits that it has on one, or alone."""
@@ -275,6 +276,7 @@ def test_devices_share_runs_without_a_word(method: str) -> None:
     assert found == {"devices": [1, 1, 3, 4], "evaluations": [1, 3, 3, 4], "alone": True, "collectives": []}
 
 
+@pytest.mark.once
 def test_a_chunk_of_iterations_stays_on_its_device() -> None:
     """A compiled iteration over MJX physics does not speak to the host, and what it needs is refused from there."""
     env = envs.make("Swimmer", physics="mjx")

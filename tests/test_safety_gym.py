@@ -17,6 +17,8 @@ from envs.safety_gym.environment import BUTTON_PAUSE, CIRCLE, SafetyGym
 from envs.safety_gym.lidar import lidar
 from envs.safety_gym.tasks import ARENA, TABLE
 
+pytestmark = pytest.mark.once
+
 RECORDED_LAYOUTS = Path(__file__).parent / "golden" / "safety_gym" / "layouts.npz"
 
 

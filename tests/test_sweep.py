@@ -183,6 +183,7 @@ class Killer(threading.Thread):
         return [pid for pid, words in command_lines().items() if wanted <= set(words)]
 
 
+@pytest.mark.once
 @in_proc
 def test_a_sweep_survives_a_killed_worker_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
