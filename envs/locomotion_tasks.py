@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -66,6 +66,7 @@ class LocomotionTask:
     observe: OfData | None = None  # [obs_dim], in place of the usual observation
     reward: Rewards | None = None  # of (model, data, action): named terms, [] each, whose sum is the reward
     start: Start | None = None  # of (model, key): qpos [nq] and qvel [nv] that an episode starts with
+    view: Literal["side", "above"] = "side"  # from where films show the robot: along the y axis, or down the z axis
 
 
 def _first_coordinate(model: mujoco.MjModel, data: Data) -> jax.Array:
@@ -128,6 +129,7 @@ TABLE = {
         cost_quantity=lambda x: jnp.linalg.norm(x.velocity),
         qpos_noise=0.1,
         qvel_noise=0.1,
+        view="above",
     ),
     "HalfCheetah": LocomotionTask(
         xml="half_cheetah.xml",
