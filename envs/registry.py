@@ -189,4 +189,7 @@ def find_task(name: Any) -> TaskInfo:
     spellings = {
         spelling.casefold(): task.name for task in _tasks.values() for spelling in (task.name, task.original or "")
     }
-    raise ValueError(f"{name}: unknown task; {hint(str(name), spellings=spellings)}choose one of {', '.join(_tasks)}")
+    raise ValueError(
+        f"{name}: unknown task; {hint(str(name), spellings=spellings)}choose one of {', '.join(_tasks)}, "
+        "or module:function for a task of your own"
+    )
