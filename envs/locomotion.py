@@ -67,6 +67,7 @@ class Locomotion:
             raise ValueError(f"{name}: contact_cost False has no effect, its cost counts no contacts; leave it out")
         self.name, self.task, self.cost_threshold = name, task, cost_threshold
         self.max_episode_steps = max_episode_steps
+        self.view = task.view
         self.model = model = load_model(task.xml)
         self.num_substeps = task.frame_skip
         self.dt = float(model.opt.timestep) * self.num_substeps

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -14,13 +14,21 @@ from envs.physics import Data
 
 @struct.dataclass(kw_only=True)
 class CostInputs:
-    """What the quantity behind a task's cost may depend on."""
+    """What the quantity behind a task's cost may depend on.
 
-    velocity: jax.Array  # [2] m/s, of the root during the control step
-    control_cost: jax.Array  # [] the task's weight times the sum of squared actions
-    contact_cost: jax.Array  # [] 0 where the contact term is switched off
-    # The `Data` after the control step and the action [action_dim] as executed. Both are None where an episode of
-    # gymnasium's simulator is scored, which reports the three numbers above alone.
+    `data` and `action` are None where an episode of gymnasium's simulator is scored, which reports the other three.
+
+    Attributes:
+        velocity: [2] m/s, of the root during the control step.
+        control_cost: [], the task's weight times the sum of squared actions.
+        contact_cost: [], 0 where the contact term is switched off.
+        data: the `envs.physics.Data` after the control step.
+        action: [action_dim], as executed.
+    """
+
+    velocity: jax.Array
+    control_cost: jax.Array
+    contact_cost: jax.Array
     data: Any = None
     action: Any = None
 
@@ -41,31 +49,58 @@ class LocomotionTask:
         forward = forward_weight v      healthy = healthy_reward (0 where the robot is not healthy)
         control = -control_weight |a|^2      contact = -contact(f)
 
-    A row may have an observation, a reward and a start of its own instead. Their functions are pure JAX, for a single
-    simulation; of `MjData` they may read what `fields` names, in `Data.fields`.
+    A row may have an observation, a reward and a start of its own instead. The functions are pure JAX, for a single
+    simulation. `model` is the `mujoco.MjModel`; `data` is the `envs.physics.Data` after the control step, and of other
+    arrays of `MjData` has those that `fields` names, in `data.fields`.
+
+    Attributes:
+        xml: the model: a file among gymnasium's own assets, or an absolute path.
+        frame_skip: engine steps per control step.
+        num_hidden: leading coordinates of the root that are left out of the observation.
+        velocity_clip: largest absolute value of qvel in the observation; None: any.
+        extra_obs: derived arrays appended to the observation, each by its name and from this row on.
+        track: the `MjData` array whose change over the control step is in `data.change`; None: none.
+        displacement: of (model, data): [2] m, by how much the root has moved in the control step, usually from
+            `data.change`. Divided by the step's duration it is the root's velocity; None: the velocity is 0.
+        forward_weight: of the term "forward".
+        control_weight: of the term "control".
+        healthy_reward: the term "healthy".
+        healthy: of (model, data): [] bool. An episode terminates where it is false; None: always healthy.
+        reward_terms: the terms whose sum is the reward. That of the paper's authors is the sum of these two.
+        contact: of `cfrc_ext` [nbody, 6]: [] contact cost; None: 0.
+        cost_quantity: of `CostInputs`: []; a step costs 1 where it exceeds the threshold, else 0.
+        qpos_noise: an episode starts at the model's qpos0 plus uniform noise of this half-width,
+        qvel_noise: and with a velocity that is uniform noise of this half-width,
+        qvel_normal: or, if this is set, normal noise of that standard deviation.
+        fields: derived `MjData` arrays that this row's own functions read.
+        observe: of (model, data): [obs_dim], in place of the usual observation.
+        reward: of (model, data, action): named terms, [] each, whose sum is the reward.
+        start: of (model, key): qpos [nq] and qvel [nv] that an episode starts with.
+        view: from where films show the robot: the "side", along the y axis, or "above".
     """
 
-    xml: str  # the model: a file among gymnasium's own assets, or an absolute path
-    frame_skip: int  # engine steps per control step
-    num_hidden: int = 0  # leading root coordinates left out of the observation
-    velocity_clip: float | None = None  # of qvel in the observation
-    extra_obs: tuple[tuple[str, int], ...] = ()  # derived arrays appended, each from this row on
-    track: str | None = None  # the `MjData` array whose change gives the velocity; None: the velocity is 0
-    displacement: OfData | None = None  # [2] m, of the root over a control step, from `Data.change`
+    xml: str
+    frame_skip: int
+    num_hidden: int = 0
+    velocity_clip: float | None = None
+    extra_obs: tuple[tuple[str, int], ...] = ()
+    track: str | None = None
+    displacement: OfData | None = None
     forward_weight: float = 1.0
     control_weight: float = 0.0
     healthy_reward: float = 0.0
-    healthy: OfData | None = None  # [] bool; None: always healthy. An episode terminates where it is false
-    reward_terms: tuple[str, ...] = ("forward", "healthy")  # the paper authors' reward is the sum of these
-    contact: Callable[[jax.Array], jax.Array] | None = None  # [] contact cost, of cfrc_ext [nbody, 6]
-    cost_quantity: Callable[[CostInputs], jax.Array]  # []; the cost is 1 where it exceeds the threshold
-    qpos_noise: float = 0.0  # an episode starts at the model's qpos0 plus uniform noise of this half-width
-    qvel_noise: float = 0.0  # and with a velocity that is uniform noise of this half-width
-    qvel_normal: bool = False  # or, if this is set, normal noise of this standard deviation
-    fields: tuple[str, ...] = ()  # derived `MjData` arrays that this row's own functions read
-    observe: OfData | None = None  # [obs_dim], in place of the usual observation
-    reward: Rewards | None = None  # of (model, data, action): named terms, [] each, whose sum is the reward
-    start: Start | None = None  # of (model, key): qpos [nq] and qvel [nv] that an episode starts with
+    healthy: OfData | None = None
+    reward_terms: tuple[str, ...] = ("forward", "healthy")
+    contact: Callable[[jax.Array], jax.Array] | None = None
+    cost_quantity: Callable[[CostInputs], jax.Array]
+    qpos_noise: float = 0.0
+    qvel_noise: float = 0.0
+    qvel_normal: bool = False
+    fields: tuple[str, ...] = ()
+    observe: OfData | None = None
+    reward: Rewards | None = None
+    start: Start | None = None
+    view: Literal["side", "above"] = "side"
 
 
 def _first_coordinate(model: mujoco.MjModel, data: Data) -> jax.Array:
@@ -128,6 +163,7 @@ TABLE = {
         cost_quantity=lambda x: jnp.linalg.norm(x.velocity),
         qpos_noise=0.1,
         qvel_noise=0.1,
+        view="above",
     ),
     "HalfCheetah": LocomotionTask(
         xml="half_cheetah.xml",

@@ -9,7 +9,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from envs.engines import PHYSICS
 from envs.lookup import hint, named_object, own_object, parts
@@ -31,7 +31,6 @@ def _locomotion(
     quantity: str,
     *,
     contact: bool = False,
-    view: Literal["side", "above"] = "side",
 ) -> TaskInfo:
     """A row; `contact` says that the cost counts contacts, so that there is a choice to leave them out."""
     return TaskInfo(
@@ -46,7 +45,6 @@ def _locomotion(
         original=f"{name}-v5",
         original_package="gymnasium",
         original_options=MappingProxyType({"include_cfrc_ext_in_observation": False} if contact else {}),
-        view=view,
     )
 
 
@@ -66,12 +64,11 @@ def _safety_gym(name: str, dims: tuple[int, int], cost: str) -> TaskInfo:
         expert_preset="safety_gym_expert",
         original=f"Safety{name}-v0",
         original_package="safety_gymnasium",
-        view="arena",
     )
 
 
 _ROWS = (
-    _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s", view="above"),
+    _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s"),
     _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
     _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
     _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
@@ -192,4 +189,7 @@ def find_task(name: Any) -> TaskInfo:
     spellings = {
         spelling.casefold(): task.name for task in _tasks.values() for spelling in (task.name, task.original or "")
     }
-    raise ValueError(f"{name}: unknown task; {hint(str(name), spellings=spellings)}choose one of {', '.join(_tasks)}")
+    raise ValueError(
+        f"{name}: unknown task; {hint(str(name), spellings=spellings)}choose one of {', '.join(_tasks)}, "
+        "or module:function for a task of your own"
+    )

@@ -37,8 +37,6 @@ class TaskInfo:
     original_package: Literal["gymnasium", "safety_gymnasium"] | None = None  # which has that environment
     # Options of that environment which make its observations those of the task.
     original_options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
-    # How a report draws an episode: bodies seen from the "side" or from "above", or a map of the whole "arena".
-    view: Literal["side", "above", "arena"] | None = None
 
     def make(self, physics: str, options: Mapping[str, Any]) -> Any:
         """Builds the task. `options` has any of its options; what is absent has the default.

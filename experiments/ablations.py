@@ -152,7 +152,7 @@ COLUMNS = {
     "answer": "answer",
     "recovered_return": "recovered return, %",
     "episode_cost": "cost",
-    "relative_cost_violation": "relative violation",
+    "relative_cost_violation": "rel. violation",
     "final_multiplier": "final lambda",
     "max_multiplier": "highest",
     "windup": "wound up",

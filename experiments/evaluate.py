@@ -127,11 +127,14 @@ def run(arguments: argparse.Namespace) -> None:
     check_policy(arguments, source.config)
     files = check_files(arguments, path)
     check_recording(arguments, source)
-    check_video(arguments, source)
+    check_video(arguments)
     for option, file in files:
         demonstration_files.check_writable(file, option)
     xla.spread_seeds(len(source.seeds))
-    loaded, settings = source.load(), _settings(arguments)
+    env = source.build()
+    if arguments.video:
+        check_drawing(arguments.video, source.task.name, env)
+    loaded, settings = source.load(env), _settings(arguments)
     unit = "steps" if arguments.simulator == "ours" else "episodes"
     with waiting.progress("evaluating", unit) as on_progress:
         episodes = evaluating.play(loaded, settings, on_progress)
@@ -223,12 +226,22 @@ def check_recording(arguments: argparse.Namespace, source: Source) -> None:
         recording.find_seed(source.run, recording.read_summary(source.run)["per_seed"], arguments.seed_index)
 
 
-def check_video(arguments: argparse.Namespace, source: Source) -> None:
-    """Raises `UsageError` where there is nothing to show in a video."""
-    if arguments.video and source.task.view is None:
-        raise UsageError(f"--video {arguments.video}: task {source.task.name} cannot be drawn; leave it out")
+def check_video(arguments: argparse.Namespace) -> None:
+    """Raises `UsageError` where the episodes of a video would not be played in our simulator."""
     if arguments.video and arguments.simulator == "original":
         raise UsageError("--simulator original: videos are made in ours; leave one of the two out")
+
+
+def check_drawing(file: Path, task: str, env: Any) -> None:
+    """Raises `UsageError` where `env`, an environment of `task`, cannot be drawn, or a program for the video lacks."""
+    from experiments.page import film  # imports MuJoCo
+
+    if reason := film.obstacle(env):
+        raise UsageError(
+            f"--video {file}: task {task} cannot be drawn, because {reason}; leave it out, or let --record FILE.npz "
+            "write its episodes as numbers"
+        )
+    video.check_encoder(file, "--video")
 
 
 def describe_recording(

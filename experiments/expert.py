@@ -143,9 +143,13 @@ def run(arguments: argparse.Namespace) -> int:
         lowest = min(outcome.summary["per_seed"], key=lambda row: row["episode_cost"])
         remedy = [str(plan.folder), "--record", str(arguments.out), "--seed-index", str(lowest["seed"])]
         remedy += ["--num-trajectories", str(arguments.num_trajectories)]
+        faster = ""
+        if plan.config.reads("multiplier_learning_rate"):
+            rate = plan.config.multiplier_learning_rate
+            faster = f", --multiplier-learning-rate above the present {rate:g} where the cost stays above the limit"
         print(
             f"no seed keeps --cost-limit {plan.config.cost_limit:g} (lowest cost {lowest['episode_cost']:g}): nothing "
-            f"was recorded; train longer (--resume --run-dir {shlex.quote(str(plan.folder))} --env-steps N, and "
+            f"was recorded; train longer (--resume --run-dir {shlex.quote(str(plan.folder))} --env-steps N{faster}, "
             "--cost-limit for a higher limit), use more seeds in a new run, or record that policy all the same: "
             f"{command_line.launcher_command('evaluate')} {shlex.join(remedy)}",
             file=sys.stderr,

@@ -43,7 +43,7 @@ _COLUMNS = {
     "episode_return": "return",
     "episode_cost": "cost",
     "recovered_return": "recovered return, %",
-    "relative_cost_violation": "relative violation",
+    "relative_cost_violation": "rel. violation",
     "final_multiplier": "final lambda",
 }
 

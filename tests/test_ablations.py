@@ -154,7 +154,7 @@ def test_few_seeds_have_no_interval_and_violations_are_marked(
     assert scores == ["3", "", "", "2 4"]
     assert (first["violation_beyond_error"], second["violation_beyond_error"]) == ("True", "")
     assert (first["final_multiplier"], second["relative_cost_violation"]) == ("", "")
-    columns = {"variant": "variant", "episode_cost": "cost", "relative_cost_violation": "violation"}
+    columns = {"variant": "variant", "episode_cost": "cost", "relative_cost_violation": "rel. violation"}
     comparison.print_rows("t", columns, rows)
     printed = capsys.readouterr().out
     cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in printed.splitlines() if "│" in line]

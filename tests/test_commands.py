@@ -19,6 +19,8 @@ from envs.registry import TASKS
 from experiments import ablations, expert, sweep, train
 from experiments.cli import console, options
 from experiments.cli.names import safe_name
+from experiments.page import film
+from experiments.runs.environments import build_environment
 from tests.probe_envs import quick_compilation
 from tests.test_documentation import PAGES, ROOT
 
@@ -211,11 +213,12 @@ def test_the_sweep_of_the_page_is_two_programs_of_six_runs(tmp_path: Path) -> No
 
 @pytest.fixture
 def own_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder with `my_tasks.py`, as docs/extending.md describes it: its first block is that file."""
+    """A folder with `my_tasks.py`, as docs/extending.md describes it: its first block and the slow cheetah."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    block = next(blocks("docs/extending.md", "python"))
-    (tmp_path / "my_tasks.py").write_text(block.partition("envs.register")[0], encoding="utf-8")
+    cart, *others = blocks("docs/extending.md", "python")
+    (cheetah,) = (block for block in others if "def slow_cheetah" in block)
+    (tmp_path / "my_tasks.py").write_text(cart.partition("envs.register")[0] + cheetah, encoding="utf-8")
     with contextlib.ExitStack() as stack:
         stack.callback(sys.modules.pop, "my_tasks", None)
         stack.enter_context(quick_compilation())
@@ -223,12 +226,21 @@ def own_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
 
 
 @pytest.mark.slow  # `test_user_tasks.py` does the same with another task, in more ways
-def test_a_task_in_a_file_is_trained_by_the_commands_of_the_page(own_tasks: Path) -> None:
+@pytest.mark.parametrize(("task", "limit", "made"), [("Cart", "20", "cart"), ("slow_cheetah", "1000", "slow_cheetah")])
+def test_a_task_in_a_file_is_trained_by_the_commands_of_the_page(
+    task: str, limit: str, made: str, own_tasks: Path
+) -> None:
     launchers = {"experiments.expert": expert, "experiments.train": train}
-    of_page = [c.words for c in commands() if c.page == "docs/extending.md" and "my_tasks:Cart" in c.words]
+    of_page = [c.words for c in commands() if c.page == "docs/extending.md" and f"my_tasks:{task}" in c.words]
     carried_out = [words[2:] for words in of_page if words[:2] == ("python", "-m") and words[2] in launchers]
     assert len(carried_out) == 2
     for module, *given in carried_out:
-        limit = ["--cost-limit", "20"] if module.endswith("expert") else []  # what is hardly trained costs more than 5
-        assert launchers[module].main([*given, *limit, *TINY]) == 0
-    assert (own_tasks / "cart.npz").is_file()
+        more = ["--cost-limit", limit] if module.endswith("expert") else []  # what is hardly trained costs more
+        assert launchers[module].main([*given, *more, *TINY]) == 0
+    assert (own_tasks / f"{made}.npz").is_file()
+
+
+def test_a_task_under_another_cost_is_built_as_the_launchers_do_it(own_tasks: Path) -> None:
+    """With the options of its function, and drawn as the task that it is made of."""
+    env = build_environment("my_tasks:slow_cheetah", "native", {"max_episode_steps": 30})
+    assert (env.name, env.max_episode_steps, film.obstacle(env)) == ("HalfCheetah", 30, "")

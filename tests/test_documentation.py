@@ -14,6 +14,8 @@ from PIL import Image
 
 from ccil_jax.agents import build
 from ccil_jax.agents.expert import expert_data
+from envs.locomotion import load_model
+from envs.locomotion_tasks import TABLE
 from envs.registry import TASKS
 from tests.probe_envs import Walk, walk_config, walk_demonstrations
 
@@ -64,6 +66,19 @@ def test_the_table_of_tasks_is_that_of_the_registry() -> None:
     found = [(name, *map(int, numbers)) for name, *numbers in rows]
     built_in = [task for task in TASKS.values() if task.original_package]  # other tests register tasks of their own
     assert found == [(task.name, task.obs_dim, task.action_dim, task.cost_limit) for task in built_in]
+
+
+def test_the_table_of_observations_is_that_of_the_models() -> None:
+    """Where velocities begin and end, and that the numbers of a row name every place once."""
+    text = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8").partition("## Locomotion")[2]
+    rows = re.findall(r"^\| (\w+) \| (\d[^|]+) \| (\d[^|]+) \|$", text, re.MULTILINE)
+    assert [name for name, *_ in rows] == list(TABLE)
+    for name, *columns in rows:
+        model, row = load_model(TABLE[name].xml), TABLE[name]
+        first = model.nq - row.num_hidden
+        for column, places in zip(columns, (range(first), range(first, first + model.nv)), strict=True):
+            named = re.findall(r"(?:^|, )(\d+)(?:-(\d+))? [a-z]", column)
+            assert [i for low, high in named for i in range(int(low), int(high or low) + 1)] == list(places)
 
 
 def test_every_task_has_a_picture_on_the_page() -> None:

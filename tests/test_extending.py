@@ -1,5 +1,7 @@
 """`docs/extending.md` from outside the package: its Python blocks in order, in a folder of their own."""
 
+import ast
+import dataclasses
 import re
 import sys
 import types
@@ -26,6 +28,7 @@ from ccil_jax.learning.constraints import CONSTRAINTS
 from ccil_jax.learning.reward_models import REWARD_MODELS
 from ccil_jax.methods import _BUILT_IN, Method, _checked, _methods
 from envs import registry
+from envs.locomotion import LocomotionTask
 from envs.testing import check_environment
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
@@ -75,6 +78,51 @@ def test_the_puck_pays_where_it_is_faster_than_a_metre_a_second(names: dict[str,
         costs.append(float(state.cost))
     assert set(costs) == {0.0, 1.0}
     assert state.obs.shape == (env.obs_dim,) == (2,)
+
+
+def test_the_slow_cheetah_pays_where_its_torso_is_fast(names: dict[str, Any]) -> None:
+    """By MuJoCo's own name of the joint along x; reward and observations are those of HalfCheetah."""
+    own, usual = names["slow_cheetah"](max_episode_steps=50), envs.make("HalfCheetah")
+    along_x = usual.model.joint("rootx").dofadr[0]
+    step, start = jax.jit(own.step), usual.reset_to(usual.model.qpos0, np.zeros(9))
+    costs = []
+    for speed in (0.5, 0.9, 2.0, 3.0):
+        state = step(usual.reset_to(usual.model.qpos0, speed * np.eye(9)[along_x]), jnp.zeros(6))
+        assert state.cost == float(state.physics.qvel[along_x] > 1.0)
+        costs.append(float(state.cost))
+    assert set(costs) == {0.0, 1.0}
+    after = jax.jit(usual.step)(start, jnp.ones(6))
+    np.testing.assert_array_equal(step(start, jnp.ones(6)).obs, after.obs)
+    assert own.max_episode_steps == 50
+
+
+def test_the_page_lists_every_field_of_a_robot() -> None:
+    """With its default, and so does the documentation of the class."""
+    rows = re.findall(r"^\| `(\w+)` \|([^|]*)\| ", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    fields = {f.name: f.default for f in dataclasses.fields(LocomotionTask)}
+    assert {name: text.strip(' "') for name, text in rows} == {
+        name: "" if default is dataclasses.MISSING else str(default).replace("'", '"')
+        for name, default in fields.items()
+    }
+    documented = re.findall(r"^        (\w+): ", str(LocomotionTask.__doc__), re.MULTILINE)
+    assert documented == list(fields)
+
+
+def test_what_the_page_imports_is_part_of_the_api() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    api = set(re.findall(r"^::: (\S+)$", (PAGE.parent / "api.md").read_text(encoding="utf-8"), re.MULTILINE))
+    used = {
+        f"{node.module}.{alias.name}"
+        for block in re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        for node in ast.walk(ast.parse(block))
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    used |= set(re.findall(r"(?<![.\w])(?:envs|ccil_jax)(?:\.[a-z]\w*)*\.[A-Za-z]\w*", text))
+    modules = {"envs.base", "envs.locomotion", "envs.testing", "envs.physics", "ccil_jax.acting.distributions"}
+    ours = {name for name in used if name.startswith(("envs.", "ccil_jax."))} - modules
+    assert len(ours) > 30
+    assert ours - api == set()
 
 
 @pytest.mark.filterwarnings("ignore:Accessing `ncon`:DeprecationWarning")  # Brax's own use of MJX

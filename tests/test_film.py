@@ -1,10 +1,12 @@
 """What films show: the engine's bodies and objects, and the episode's own return and cost."""
 
+import types
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -15,22 +17,28 @@ from ccil_jax.acting.rollout import Actor
 from ccil_jax.config import Config
 from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training.filesystem import file_sha256
-from envs.registry import TASKS
-from experiments.page import episodes, film
+from envs.locomotion import Locomotion, LocomotionTask
+from envs.registry import TASKS, TaskInfo
+from experiments.page import episodes, film, video
 from experiments.policies import evaluating, policy_file
 from experiments.policies.evaluating import Loaded
 from experiments.policies.numpy_policy import policies
+from tests.probe_envs import Walk
 
 SHIPPED = policy_file.shipped().parent / "demonstrations"
 
 
 def untrained(task: str, **options: Any) -> Loaded:
     """An untrained policy with two seeds."""
-    env, config = envs.make(task, physics="native", **options), Config(method="trpo", hidden_sizes=(8,))
+    return untrained_on(envs.make(task, physics="native", **options), TASKS[task])
+
+
+def untrained_on(env: Any, task: TaskInfo = TASKS["Hopper"]) -> Loaded:
+    config = Config(method="trpo", hidden_sizes=(8,))
     params = jax.vmap(networks.policy_of(config, env).init)(jax.random.split(jax.random.key(0), 2))
     return Loaded(
         source=Path("run"),
-        task=TASKS[task],
+        task=task,
         env=env,
         config=config,
         actor=Actor(policy_params=params, obs_statistics=None),
@@ -105,7 +113,7 @@ def test_a_demonstration_is_shown_where_its_observations_say() -> None:
         episode_ends=np.array([30]),
     )
     env = envs.make("HalfCheetah", physics="native")
-    shown = film.of_demonstration(env, "side", found)
+    shown = film.of_demonstration(env, found)
     assert shown is not None
     assert shown.steps.tolist() == list(range(31))
     torso = shown.strokes.places[:30, 0].reshape(30, 2, 2).mean(axis=1)
@@ -116,7 +124,122 @@ def test_a_demonstration_is_shown_where_its_observations_say() -> None:
     np.testing.assert_allclose(shown.returns[[0, 10, 30]], [0.0, 5.0, 15.0])
     assert shown.costs[[4, 5, 30]].tolist() == [0, 1, 1]
     assert np.flatnonzero(shown.paid).tolist() == [5]
-    assert film.of_demonstration(object(), "side", found) is None
+    assert film.of_demonstration(object(), found) is None
+
+
+ROBOT = """
+<mujoco>
+  <option timestep="0.02" gravity="0 0 0"/>
+  <asset><mesh name="bar" vertex="0 0 0  .5 0 0  0 .2 0  .5 .2 0  0 0 .3  .5 0 .3  0 .2 .3  .5 .2 .3"/></asset>
+  <worldbody>
+    <geom type="plane" size="9 9 1"/>
+    <body pos="0 0 1">
+      <freejoint/>
+      <geom type="box" size=".1 .2 .5" euler="0 30 90"/>
+      <geom type="cylinder" size=".3 .05" pos="1 0 -.7" euler="90 0 0"/>
+      <geom type="ellipsoid" size=".2 .1 .4" pos="-1 0 0" euler="0 60 0"/>
+      <body pos="1.2 .3 .4" euler="0 -20 0">
+        <joint name="swing" axis="0 1 0"/>
+        <geom type="capsule" size=".06" fromto="0 0 0 .4 0 .3"/>
+        <geom type="mesh" mesh="bar" group="3"/>
+      </body>
+      <body pos="-1.2 0 .8" euler="0 40 0">
+        <geom type="mesh" mesh="bar"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="swing" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Locomotion:
+    """A robot of the user's own with shapes of all kinds. The mesh beside the capsule is not drawn."""
+    path = tmp_path_factory.mktemp("robot") / "robot.xml"
+    path.write_text(ROBOT, encoding="utf-8")
+    row = LocomotionTask(
+        xml=str(path), frame_skip=2, num_hidden=3, qvel_noise=0.5, cost_quantity=lambda x: x.velocity[0]
+    )
+    return Locomotion(row, name="Robot", physics="native", cost_threshold=0.1, max_episode_steps=10)
+
+
+def seen_by_rays(env: Any, qpos: np.ndarray, shown: film.Film, index: int) -> np.ndarray:
+    """[80, 160] bool: where a frame of a film should show a body, from rays along y that MuJoCo itself casts."""
+    data = mujoco.MjData(env.model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(env.model, data)
+    pixel, groups, geom = shown.span / 80, np.array([1, 1, 1, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+    hit = np.zeros((80, 160), bool)
+    for i, j in np.ndindex(hit.shape):
+        x, z = shown.centre[index] + pixel * np.array([j - 79.5, 39.5 - i])
+        mujoco.mj_ray(env.model, data, np.array([x, -9.0, z]), np.array([0.0, 1.0, 0.0]), groups, 1, -1, geom)
+        hit[i, j] = geom[0] > 0
+    return hit
+
+
+def test_a_robot_of_ones_own_is_drawn_as_mujoco_sees_it(robot: Locomotion) -> None:
+    """Its silhouette in the first and the last frame; and the film of the same task under another cost counts that."""
+    loaded = untrained_on(envs.with_cost(robot, lambda before, action, after: jnp.square(action).sum()))
+    shown = film.record(loaded, 0, deterministic=True)
+    policy = policies(loaded.config, loaded.actor, loaded.env)[0]
+    start = state = jax.jit(loaded.env.reset)(jax.random.split(jax.random.key(0))[0])
+    step = jax.jit(loaded.env.step)
+    for _ in range(10):
+        state = step(state, policy.mode(np.asarray(state.obs)).astype(np.float32))
+    np.testing.assert_allclose(shown.costs[-1], state.episode_cost, rtol=1e-4)
+    assert shown.costs[-1] > 0
+    assert shown.steps.tolist() == list(range(11))
+    for index, there in ((0, start), (10, state)):
+        picture = np.asarray(video.draw(shown, index, ""))[64:].astype(int)
+        drawn = [np.abs(picture - color).max(axis=-1) < 12 for color in ([0x0B, 0x6E, 0x99], [0xD1, 0x49, 0x5B])]
+        drawn_there = (drawn[0] | drawn[1])[2::4, 2::4]
+        seen = seen_by_rays(robot, np.asarray(there.physics.qpos), shown, index)
+        assert seen.sum() > 500
+        assert (drawn_there & seen).sum() > 0.9 * (drawn_there | seen).sum()
+
+
+def test_where_the_physics_has_failed_the_last_frame_repeats_a_pose(robot: Locomotion) -> None:
+    qpos = np.tile(robot.model.qpos0, (3, 1)) + np.array([[0.0], [0.1], [np.nan]])
+    shown = film._make(robot, {"qpos": qpos}, {}, np.zeros(3), np.zeros(3))
+    np.testing.assert_array_equal(shown.strokes.places[2], shown.strokes.places[1])
+    assert np.isfinite(shown.strokes.places).all()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_of_the_package_can_be_drawn(task: str) -> None:
+    assert film.obstacle(envs.make(task, physics="native")) == ""
+
+
+def test_what_cannot_be_drawn_has_a_reason(robot: Locomotion) -> None:
+    def changed(**changes: Any) -> Any:
+        return types.SimpleNamespace(
+            **{"model": robot.model, "dt": 0.04, "view": "side", "engine_arrays": id} | changes
+        )
+
+    empty = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    assert film.obstacle(changed()) == ""
+    assert film.obstacle(Walk()) == film.obstacle(changed(model=1)) == "it has no MuJoCo model"
+    assert film.obstacle(types.SimpleNamespace(model=robot.model)).endswith(
+        "attribute engine_arrays and no dt and no view"
+    )
+    assert (
+        film.obstacle(changed(view="below")) == "its attribute view is 'below', and not one of 'side', 'above', 'arena'"
+    )
+    assert film.obstacle(changed(model=empty)) == "no body of its MuJoCo model has a shape to draw"
+
+
+@pytest.mark.parametrize(
+    ("joints", "count"),
+    [
+        ("<joint type='slide'/><joint/>", 2),
+        ("<joint type='slide'/><joint type='ball'/>", 1),
+        ("<freejoint/>", 3),
+    ],
+)
+def test_a_place_is_summed_up_as_long_as_velocities_are_its_derivatives(joints: str, count: int) -> None:
+    xml = f"<mujoco><worldbody><body>{joints}<geom size='1'/></body></worldbody></mujoco>"
+    assert film._num_summable(mujoco.MjModel.from_xml_string(xml)) == count
 
 
 @pytest.mark.parametrize(

@@ -522,9 +522,13 @@ def test_no_seed_within_the_limit_is_a_failure(
     rows = [{"seed": 0, "episode_return": 1.0, "episode_cost": 33.0}, {**rows[0], "seed": 1}]
     monkeypatch.setattr(expert, "execute", lambda plan: SimpleNamespace(summary={"per_seed": rows}))
     made = ["--env", "Swimmer", "--out", f"{tmp_path}/e.npz", "--run-dir", f"{tmp_path}/run", *TINY]
-    assert expert.main([*made, "--cost-limit", "20"]) == 1
+    assert expert.main([*made, "--cost-limit", "20", "--multiplier-learning-rate", "0.3"]) == 1
     said = capsys.readouterr().err
     assert "no seed keeps --cost-limit 20 (lowest cost 21)" in said
+    advice = "--multiplier-learning-rate above the present 0.3 where the cost stays above the limit"
+    assert advice in said
     remedy = f"evaluate {tmp_path}/run --record {tmp_path}/e.npz --seed-index 1 --num-trajectories 10"
     assert f"python -m experiments.{remedy}\n" in said
+    assert expert.main([*made, "--cost-limit", "20", "--multiplier-update", "pid"]) == 1
+    assert "multiplier-learning-rate" not in capsys.readouterr().err
     assert not (tmp_path / "e.npz").exists()

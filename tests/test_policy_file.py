@@ -156,7 +156,7 @@ def test_policies_fit_their_task(tmp_path: Path) -> None:
 def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
     """Their returns and costs, 3 +- 1 by hand, and an episode of each beside one of the task's expert.
 
-    That of an unknown task is in the table alone.
+    That of an unknown task is in the table, and a sentence says why it is not shown.
     """
     played = {
         "episode_return": np.array([[2.0, 4.0], [2.0, 4.0]]),
@@ -169,5 +169,6 @@ def test_a_page_shows_the_policies_of_files(tmp_path: Path) -> None:
     assert "<td>malm on Swimmer, seed 4</td><td>3.00 <small>&plusmn; 1.00</small></td>" in page
     assert "<td>5.00 <small>&plusmn; 0.00</small></td><td>3.00</td><td>-</td>" in page
     assert "<td>malm on a:b, seed 7</td><td>-</td>" in page
+    assert "No episode of malm on a:b, seed 7 is shown: a:b is no task of this package" in page
     assert page.count("<canvas") == 4
     assert page.count("the shipped expert</") == 2

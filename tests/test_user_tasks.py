@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ccil_jax.demonstrations.trajectories import load_demonstrations
 from ccil_jax.errors import UserError
@@ -19,6 +20,7 @@ from ccil_jax.training import manifests
 from experiments import ablations, benchmark, convert, evaluate, expert, report, sweep, train
 from experiments.cli import command_line
 from experiments.cli.names import safe_name
+from experiments.page import video
 from experiments.runs import figures, run_folder
 from experiments.runs.environments import build_environment
 from experiments.runs.metrics_file import read_metrics
@@ -248,6 +250,69 @@ def test_an_agent_that_reports_other_metrics(folder: Path) -> None:
     assert read_metrics(Path("agent"))["my/loss"].shape == (2, 2)
     assert Path("agent/figures/my_loss.png").is_file()
     assert report.main(["agent", "run", "--out", "agent.html"]) == 0
+
+
+ROBOTS = """
+from pathlib import Path
+
+import jax.numpy as jnp
+import envs
+from envs.locomotion import Locomotion, LocomotionTask
+
+POLE = LocomotionTask(
+    xml=str(Path("pole.xml").resolve()), frame_skip=2, num_hidden=1, cost_quantity=lambda x: jnp.abs(x.velocity[0]),
+    qpos_noise=0.1, view="side",
+)
+
+
+def pole(physics: str = "native", max_episode_steps: int = 10):
+    env = Locomotion(POLE, name="Pole", physics=physics, max_episode_steps=max_episode_steps, cost_threshold=1.0)
+    return envs.with_cost(env, lambda before, action, after: jnp.square(action).sum())
+"""
+POLE = """
+<mujoco>
+  <option timestep="0.02"/>
+  <worldbody>
+    <body pos="0 0 .5">
+      <joint type="slide" axis="1 0 0"/>
+      <geom type="box" size=".2 .1 .1"/>
+      <body><joint name="swing" axis="0 1 0"/><geom type="capsule" size=".05" fromto="0 0 0 0 0 .6"/></body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="swing" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_robot_of_ones_own_is_seen_in_a_video_and_on_the_page(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From its own model, with another cost; a task without a model is said to have none, wherever it is asked for."""
+    Path("my_robots.py").write_text(ROBOTS, encoding="utf-8")
+    Path("pole.xml").write_text(POLE, encoding="utf-8")
+    given = ["--env", "my_robots:pole", "--unconstrained", *TINY, "--num-seeds", "1", "--env-steps", "120"]
+    assert expert.main([*given, "--out", "pole.npz", "--run-dir", "pole"]) == 0
+    assert evaluate.main(["pole", "--episodes", "2", "--video", "pole.gif"]) == 0
+    with Image.open("pole.gif") as film:
+        assert film.n_frames == 11
+    assert report.main(["pole", "run", "--out", "two.html"]) == 0
+    page = Path("two.html").read_text(encoding="utf-8")
+    assert page.count("<canvas") == 1
+    assert "No episode of ccil is shown: its task cannot be drawn, because it has no MuJoCo model." in page
+    monkeypatch.chdir(folder.parent)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry not in ("", str(folder))])
+    monkeypatch.delitem(sys.modules, "my_robots")
+    assert report.main([str(folder / "pole"), "--out", str(folder / "elsewhere.html")]) == 0
+    page = (folder / "elsewhere.html").read_text(encoding="utf-8")
+    assert "No episode of trpo is shown: its task cannot be built here" in page
+    assert "there is no module &#x27;my_robots&#x27;" in page
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(video.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(evaluate.evaluating, "load", lambda *_: pytest.fail("policies are loaded"))
+    capsys.readouterr()
+    for name in ("a.gif", "a.mp4"):
+        said = refused(capsys, evaluate, "run", "--video", name)
+        assert f"--video {name}: task {TASK} cannot be drawn, because it has no MuJoCo model; leave it out" in said
 
 
 def test_options_of_a_task_may_be_named_like_those_of_a_run(folder: Path) -> None:

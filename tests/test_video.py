@@ -5,7 +5,6 @@ import itertools
 import json
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -24,6 +23,7 @@ from experiments.page import video
 from experiments.policies import evaluating
 from experiments.policies.numpy_policy import policies
 from tests.films import make_film
+from tests.probe_envs import Walk
 
 RED = (0xD1, 0x49, 0x5B)
 
@@ -107,11 +107,11 @@ def test_what_cannot_be_written_is_refused_at_once(
             evaluate.main(["--policy", "Hopper", *more])
         assert end.value.code == 2
         assert message in capsys.readouterr().err
-    source: Any = evaluate.sources.of_file(Path("Hopper"))
-    source = evaluating.dataclasses.replace(source, task=evaluating.dataclasses.replace(source.task, view=None))
-    arguments = evaluate.make_parser().parse_args(["--policy", "Hopper", "--video", "a.gif"])
-    with pytest.raises(UsageError, match=r"--video a\.gif: task Hopper cannot be drawn; leave it out"):
-        evaluate.check_video(arguments, source)
+    message = (
+        r"--video a\.mp4: task my_tasks:walk cannot be drawn, because it has no MuJoCo model; leave it out, or let"
+    )
+    with pytest.raises(UsageError, match=message):  # and nobody installs a package in vain
+        evaluate.check_drawing(Path("a.mp4"), "my_tasks:walk", Walk())
     assert [path.name for path in tmp_path.iterdir()] == ["old.gif"]
 
 

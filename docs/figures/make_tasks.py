@@ -62,7 +62,7 @@ VIEWS = {
     "Walker2d": View(at=(0.05, 0.0, 0.7), distance=3.0, azimuth=-65, elevation=10, joints=WALKING),
     "Ant": View(at=(0.0, 0.0, 0.3), distance=3.8, azimuth=-60, elevation=24, joints=STANDING),
     "Humanoid": View(at=(0.0, 0.0, 0.75), distance=3.0, azimuth=-50, elevation=10, joints=STRIDING),
-    **{name: _arena(seed=3) for name, task in TASKS.items() if task.view == "arena"},
+    **{name: _arena(seed=3) for name, task in TASKS.items() if task.family == "safety_gym"},
 }
 
 

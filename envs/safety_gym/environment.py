@@ -55,6 +55,8 @@ class SafetyGym:
         num_threads: of the native engine; None shares the usable CPUs among JAX's local devices.
     """
 
+    view = "arena"  # films show a map of it
+
     def __init__(
         self,
         name: str,

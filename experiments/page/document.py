@@ -57,9 +57,9 @@ def page(
     Args:
         entries: the runs.
         seed: of the bootstrap intervals.
-        play_run: makes the HTML of an episode of a run, or an empty text; None leaves episodes out.
+        play_run: makes the HTML of an episode of a run, or of a sentence why there is none; None leaves both out.
         files: policies that are shown too.
-        play_policy: makes the HTML of an episode of a policy of a file; None leaves episodes out.
+        play_policy: the same for a policy of a file.
     """
     tasks = tasks_of(entries)
     title = f"{', '.join(tasks)}: imitation under cost constraints" if tasks else "Policies under cost constraints"
@@ -95,7 +95,7 @@ def _task_section(
     yield f"<h2>{text(task)}</h2>"
     yield tables.metrics(entries, seed)
     yield plots.of_curves(entries)
-    yield from (played for e in entries if play_run and (played := play_run(e)))
+    yield from (play_run(e) for e in entries if play_run)
     yield f"<details><summary>Every seed</summary>{tables.seeds(entries)}</details>"
     yield "<details><summary>How the runs differ, and where they were made</summary>"
     yield f"{tables.differences(entries)}</details>"
@@ -116,4 +116,4 @@ def _policies_section(files: Sequence[PolicyFile], play: Callable[[PolicyFile, i
     if by_task:
         yield plots.of_policies(by_task)
     shown = ((file, index) for file in files for index in range(file.num_policies))
-    yield from (played for file, index in shown if play and (played := play(file, index)))
+    yield from (play(file, index) for file, index in shown if play)

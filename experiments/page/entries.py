@@ -29,14 +29,6 @@ class Entry:
         """Name of the task."""
         return str(self.run.facts["task"])
 
-    @property
-    def view(self) -> str | None:
-        """How an episode of the task is drawn (`TaskInfo.view`); None if it cannot be drawn or is not known here."""
-        try:
-            return run_folder.task_of(self.run).view
-        except UsageError:
-            return None
-
 
 def read_entries(folders: Sequence[Path]) -> list[Entry]:
     """Reads the runs. Raises `UsageError` for a folder that is not a finished run, or is given twice."""

@@ -1,5 +1,9 @@
-"""The episodes that a page plays: the learner's, and beside it the expert's where that is at hand."""
+"""The episodes that a page plays: the learner's, and beside it the expert's where that is at hand.
 
+Where there is no episode to play, a sentence says why.
+"""
+
+import html
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,16 +19,23 @@ from experiments.page.tables import policy_label
 from experiments.policies import evaluating, policy_file
 from experiments.policies.evaluating import Loaded
 from experiments.policies.policy_file import PolicyFile
+from experiments.runs import run_folder
 
 
 def of_run(entry: Entry) -> str:
     """The HTML of an episode of the seed with the highest return, beside one of the expert.
 
-    It is empty for a run without checkpoints, and for a task that cannot be drawn or is not known here.
+    It is a sentence where there is nothing to play: the run has no checkpoint, or its task cannot be built or drawn.
     """
-    if not (entry.run.folder / "checkpoints").is_dir() or entry.view is None:
-        return ""
-    loaded = evaluating.load(entry.run)
+    if not (entry.run.folder / "checkpoints").is_dir():
+        return _nothing(entry.label, "its folder holds no checkpoint")
+    try:
+        env = evaluating.build(run_folder.task_of(entry.run), entry.run.facts)
+    except UserError as error:
+        return _nothing(entry.label, f"its task cannot be built here ({error})")
+    if reason := film.obstacle(env):
+        return _nothing(entry.label, f"its task cannot be drawn, because {reason}")
+    loaded = evaluating.load(entry.run, env)
     best, caption = choose_seed(entry)
     films = [(f"{entry.label}, seed {best}", film.record(loaded, best))]
     facts = entry.run.facts["demonstrations"]
@@ -35,16 +46,24 @@ def of_run(entry: Entry) -> str:
 
 
 def of_policy(file: PolicyFile, index: int) -> str:
-    """The HTML of an episode of a policy, beside one of the shipped expert; empty for a task that cannot be drawn."""
-    task = TASKS.get(file.training["task"])
-    if task is None or task.view is None:
-        return ""
-    loaded, label = evaluating.load_file(file, task), policy_label(file, index)
+    """The HTML of an episode of a policy, beside one of the shipped expert; a sentence for a task of a user's own."""
+    label, task = policy_label(file, index), TASKS.get(file.training["task"])
+    if task is None:  # a module that a file names is not imported: it would run its code
+        name = file.training["task"]
+        return _nothing(label, f"{name} is no task of this package; the page of its run's folder shows it")
+    env = evaluating.build(task, file.training)
+    if reason := film.obstacle(env):
+        return _nothing(label, f"its task cannot be drawn, because {reason}")
+    loaded = evaluating.load_file(file, task, env)
     films = [(label, film.record(loaded, index))]
     shipped = _shipped(task.name)
     if shipped is not None and file.path.resolve() != shipped.resolve():
         films.append(("the shipped expert", _of_shipped(shipped, loaded)))
     return player.figure(films, f"One episode of {label}.")
+
+
+def _nothing(label: str, reason: str) -> str:
+    return f"<p class=note>{html.escape(f'No episode of {label} is shown: {reason}.')}</p>"
 
 
 def _expert(loaded: Loaded, facts: dict[str, Any]) -> tuple[Sequence[tuple[str, Film]], str]:
@@ -53,9 +72,8 @@ def _expert(loaded: Loaded, facts: dict[str, Any]) -> tuple[Sequence[tuple[str, 
     `facts` says which file of demonstrations the run learnt from.
     """
     task = loaded.task
-    assert task.view is not None  # or nothing is drawn of it
     demonstrations, missing = _demonstrations(facts)
-    found = demonstrations and film.of_demonstration(loaded.env, task.view, demonstrations)
+    found = demonstrations and film.of_demonstration(loaded.env, demonstrations)
     if found:
         note = "Beside it, the first of its demonstrations; where its root is follows from the recorded velocities."
         return [("the expert, as demonstrated", found)], note
@@ -88,4 +106,4 @@ def _shipped(task: str) -> Path | None:
 
 def _of_shipped(path: Path, loaded: Loaded) -> Film:
     """An episode of a shipped expert on the environment of `loaded`, with the same start."""
-    return film.record(evaluating.on_environment(policy_file.read(path), loaded.task, loaded.env), 0)
+    return film.record(evaluating.load_file(policy_file.read(path), loaded.task, loaded.env), 0)

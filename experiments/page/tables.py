@@ -18,7 +18,7 @@ _COLUMNS = (
     ("episode_return", "return"),
     ("episode_cost", "cost"),
     ("recovered_return", "recovered return, %"),
-    ("relative_cost_violation", "relative cost violation"),
+    ("relative_cost_violation", "rel. violation"),
     ("penalized_return", "penalised return, %"),
     ("cost_rate", "cost rate in training"),
 )
@@ -71,7 +71,7 @@ def across_tasks(entries: Sequence[Entry], seed: int) -> str:
             strata = [np.array([row.get(name) for row in e.summary["per_seed"]], np.float64) for e in chosen]
             cells.append(_interval(strata, seed) if all(np.isfinite(s).all() for s in strata) else "-")
         rows.append(cells)
-    titles = ["", "tasks", "recovered return, %", "relative cost violation", "penalised return, %"]
+    titles = ["", "tasks", "recovered return, %", "rel. violation", "penalised return, %"]
     return table(titles, rows)
 
 

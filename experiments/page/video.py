@@ -29,6 +29,10 @@ def check(path: Path, option: str) -> None:
     """Raises `UsageError`, which names `option`, where no video can be written to a file of this name."""
     if path.suffix not in SUFFIXES:
         raise UsageError(f"{option} {path}: unknown kind of video; end its name with {' or '.join(SUFFIXES)}")
+
+
+def check_encoder(path: Path, option: str) -> None:
+    """Raises `UsageError`, which names `option`, where the package that writes such a video is not installed."""
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise UsageError(
             f"{option} {path}: needs the package imageio-ffmpeg; `pip install 'ccil_jax[video]'`, or end its name "

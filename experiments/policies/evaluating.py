@@ -53,16 +53,23 @@ class Loaded:
         return dataclasses.replace(self, actor=actor, training=training)
 
 
-def load(run: Run) -> Loaded:
-    """Builds the task of a run and reads the policies from its newest checkpoint.
+def build(task: TaskInfo, facts: Mapping[str, Any]) -> Any:
+    """Builds `task` as the policies of a run or a file know it: with the `physics` and `env_options` in `facts`.
+
+    Raises:
+        UserError: the task cannot be built.
+    """
+    return build_environment(task.name, facts["physics"], facts["env_options"])
+
+
+def load(run: Run, env: Any) -> Loaded:
+    """Reads the policies of a run on `env`, its task, from the newest checkpoint.
 
     Raises:
         UserError: the task is not known here, or the checkpoint cannot be read.
     """
-    task = run_folder.task_of(run)
     from ccil_jax.training import runner
 
-    env = build_environment(task.name, run.facts["physics"], run.facts["env_options"])
     loaded = runner.load(run.config, env, run.folder.resolve() / "checkpoints", run.facts["num_seeds"])
     return of_run(run, env, loaded.config, loaded.actor, loaded.env_steps)
 
@@ -81,17 +88,7 @@ def of_run(run: Run, env: Any, config: Config, actor: Any, env_steps: int) -> Lo
     )
 
 
-def load_file(file: PolicyFile, task: TaskInfo) -> Loaded:
-    """Builds `task`, which the file names, and takes the policies from the file.
-
-    Raises:
-        UserError: the task cannot be built, or the policies do not fit it.
-    """
-    training = file.training
-    return on_environment(file, task, build_environment(task.name, training["physics"], training["env_options"]))
-
-
-def on_environment(file: PolicyFile, task: TaskInfo, env: Any) -> Loaded:
+def load_file(file: PolicyFile, task: TaskInfo, env: Any) -> Loaded:
     """The policies of a file on `env`, an environment of `task`. Raises `UserError` where they do not fit it."""
     file.check_sizes(env.obs_dim, env.action_dim)
     training = file.training

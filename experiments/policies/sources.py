@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from ccil_jax.config import Config
 from envs import registry
@@ -22,7 +23,8 @@ class Source:
     task: TaskInfo
     config: Config
     seeds: Sequence[int]  # of the policies, as the user calls them
-    load: Callable[[], Loaded]
+    build: Callable[[], Any]  # builds the task
+    load: Callable[[Any], Loaded]  # takes the policies, of the task that `build` has returned
     run: Run | None  # None for a file
 
 
@@ -40,7 +42,8 @@ def of_run(folder: Path) -> Source:
         task=task,
         config=stored.config,
         seeds=range(stored.facts["num_seeds"]),
-        load=lambda: evaluating.load(stored),
+        build=lambda: evaluating.build(task, stored.facts),
+        load=lambda env: evaluating.load(stored, env),
         run=stored,
     )
 
@@ -53,11 +56,13 @@ def of_file(named: Path) -> Source:
         raise UsageError(
             f"--policy {named}: of task {training['task']}, which is none of this package; give the folder of its run"
         )
+    task = registry.TASKS[training["task"]]
     return Source(
-        title=f"{training['method']} on {training['task']}",
-        task=registry.TASKS[training["task"]],
+        title=f"{training['method']} on {task.name}",
+        task=task,
         config=file.config,
         seeds=training["seed_indices"],
-        load=lambda: evaluating.load_file(file, registry.TASKS[training["task"]]),
+        build=lambda: evaluating.build(task, training),
+        load=lambda env: evaluating.load_file(file, task, env),
         run=None,
     )

@@ -163,9 +163,10 @@ def print_table(title: str, rows: list[dict[str, Any]], aggregate: Mapping[str, 
     """
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", caption_justify="left")
+    # Cells without the usual blank on their left let the table fit a terminal of 80 columns.
+    table = Table(title=title, title_justify="left", caption_justify="left", padding=(0, 1, 0, 0))
     columns = ("episode_return", "episode_cost", "recovered_return", "relative_cost_violation")
-    for heading in ("", "return", "cost", "recovered %", "violation"):
+    for heading in ("", "return", "cost", "recovered %", "rel. violation"):
         table.add_column(heading, justify="right" if heading else "left", no_wrap=True)
     for row in rows:
         means = (with_error(row[name], row.get(f"{name}_standard_error")) for name in columns[:2])

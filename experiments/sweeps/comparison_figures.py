@@ -12,7 +12,7 @@ from experiments.runs.figures import COLORS, STYLE, png
 from experiments.runs.labels import literal
 from experiments.sweeps.comparison import Row, note_on_intervals
 
-_MEASURED = {"recovered_return": "recovered return, %", "relative_cost_violation": "relative cost violation"}
+_MEASURED = {"recovered_return": "recovered return, %", "relative_cost_violation": "rel. violation"}
 _RAW = {"episode_return": "return per episode", "episode_cost": "cost per episode"}
 _REFERENCES = {"recovered_return": 100.0, "relative_cost_violation": 0.0}  # the expert's
 
