@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,25 +58,25 @@ def blocks(page: str, *languages: str) -> Iterator[str]:
     yield from (content for language, content in FENCE.findall(text) if language in languages)
 
 
-def words_of(line: str) -> tuple[str, ...]:
+def words_of(line: str, replaced: Mapping[str, str] = PLACEHOLDERS) -> tuple[str, ...]:
     """Without comments, variables of the environment in front, where the output goes, and what a reader replaces."""
     words = shlex.split(line, comments=True)
     words = words[: words.index(">")] if ">" in words else words
     while words and re.match(r"[A-Z_]+=", words[0]):
         words = words[1:]
-    return tuple(PLACEHOLDERS.get(word, word) for word in words)
+    return tuple(replaced.get(word, word) for word in words)
 
 
-def commands() -> Iterator[Command]:
+def commands(replaced: Mapping[str, str] = PLACEHOLDERS) -> Iterator[Command]:
     for page in PAGES:
         for block in blocks(page, *SHELL):
             for line in block.replace("\\\n", " ").splitlines():
-                if line.strip() and line[0] not in OUTPUT and (words := words_of(line)):
+                if line.strip() and line[0] not in OUTPUT and (words := words_of(line, replaced)):
                     yield Command(page, words)
         for span in INLINE.findall(FENCE.sub("", (ROOT / page).read_text(encoding="utf-8"))):
             span = " ".join(span.split())
             if LAUNCHED.match(span) and not span.endswith("NAME") and " | " not in span and "NAME ..." not in span:
-                yield Command(page, words_of(span.removeprefix("python -m ").removesuffix(" ...")))
+                yield Command(page, words_of(span.removeprefix("python -m ").removesuffix(" ..."), replaced))
 
 
 def check_launcher(name: str, given: list[str]) -> None:
