@@ -19,6 +19,7 @@ MAX_LAYERS = 32
 _AGAIN = "write the file again with `evaluate --export`"
 _GAUSSIAN, _SQUASHED = ("action_std",), ("action_center", "action_half_range")
 _OBSERVED = ("obs_mean", "obs_std", "obs_clip")
+_BOUNDS = ("action_low", "action_high")  # which files of earlier versions lack, the shipped ones among them
 _EPISODES = ("episode_return", "episode_cost")
 _TRAINING = {"task": str, "method": str, "env_options": dict, "physics": str}  # what has to be known of a training
 
@@ -106,14 +107,13 @@ def find(named: Path) -> Path:
 def read(path: Path) -> PolicyFile:
     """Reads and checks a file. Imports no JAX. Raises `ArchiveError`, which names file, key and remedy."""
     layers = [f"{kind}_{i}" for i in range(MAX_LAYERS) for kind in ("kernel", "bias")]
-    optional = frozenset({*layers[2:], *_GAUSSIAN, *_SQUASHED, *_EPISODES})
-    arrays = npz.read(
-        path, (*layers, *_GAUSSIAN, *_SQUASHED, *_OBSERVED, *_EPISODES, "metadata"), optional=optional, remedy=_AGAIN
-    )
+    optional = frozenset({*layers[2:], *_GAUSSIAN, *_SQUASHED, *_BOUNDS, *_EPISODES})
+    names = (*layers, *_GAUSSIAN, *_SQUASHED, *_OBSERVED, *_BOUNDS, *_EPISODES, "metadata")
+    arrays = npz.read(path, names, optional=optional, remedy=_AGAIN)
     metadata = npz.json_object(arrays.pop("metadata"), f"{path}: 'metadata'", _AGAIN)
     _check_metadata(path, metadata)
     for name, values in arrays.items():
-        if values.dtype.kind != "f" or not (np.isfinite(values).all() or name == "obs_clip"):
+        if values.dtype.kind != "f" or not (np.isfinite(values).all() or name in ("obs_clip", *_BOUNDS)):
             raise ArchiveError(f"{path}: '{name}' holds something else than finite numbers; {_AGAIN}")
     last = _GAUSSIAN if "action_std" in arrays else _SQUASHED
     depth = sum(name.startswith("kernel_") for name in arrays)
@@ -130,6 +130,9 @@ def read(path: Path) -> PolicyFile:
             _same(shapes[name], shape)
         _same(shapes["obs_mean"], (num, obs_dim))
         _same(shapes["obs_std"], (num, obs_dim))
+        if set(_BOUNDS) & arrays.keys():
+            low, high = (arrays[name] for name in _BOUNDS)
+            _same((low.shape, high.shape, bool((low <= high).all())), (shapes[last[0]], shapes[last[0]], True))
         for name in set(_EPISODES) & arrays.keys():
             _same((len(shapes[name]), shapes[name][:1]), (2, (num,)))
         if last == _GAUSSIAN:
