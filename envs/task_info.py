@@ -57,9 +57,10 @@ class TaskInfo:
         build = named_object(self.build) if isinstance(self.build, str) else self.build
         env = build(**arguments)
         if missing := [member for member in _MEMBERS if not hasattr(env, member)]:
+            of_brax = hasattr(env, "observation_size") and hasattr(env, "action_size")
             raise ValueError(
                 f"{self.name}: what was built, a {type(env).__name__}, has no {', '.join(missing)}; "
-                "return an envs.Environment"
+                f"return an envs.Environment{' (wrap it in envs.FromBrax)' if of_brax else ''}"
             )
         for member in ("obs_dim", "action_dim"):
             wanted, found = getattr(self, member), getattr(env, member)
