@@ -10,6 +10,7 @@ import numpy as np
 from ccil_jax.training import filesystem
 from ccil_jax.training.progress import Display
 from experiments.cli import xla
+from experiments.cli.command_line import RUN_LOCK
 from experiments.cli.interruption import Interruption
 from experiments.runs import fault_files, run_folder, summary
 from experiments.runs.environments import build_environment
@@ -60,7 +61,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
     """
     setup, config = program.setup, program.config
     with (
-        filesystem.hold(program.checkpoint_dir / ".run.lock"),
+        filesystem.hold(program.checkpoint_dir / RUN_LOCK),
         Display(
             f"{config.method} {setup.task}",
             config.num_iterations,
@@ -93,7 +94,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
                     f"seed {capped}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, and "
                     "the cost above its limit: the cost does not follow it"
                 )
-        display.message(f"evaluating {setup.eval_episodes} episodes per seed ...")
+        display.message(f"evaluating {setup.eval_episodes} episodes per seed, and of the random policy ...")
         evaluations, random = _evaluate(setup, [result for _, result in trained], env)
         return [
             Outcome(
