@@ -478,7 +478,8 @@ def check_types(config: Config) -> None:
         value = getattr(config, name)
         if name in CHOICES:
             if value not in CHOICES[name]:
-                raise ConfigError(f"--{name} {value!r}: unknown; choose one of {', '.join(CHOICES[name])}")
+                own = _OWN[name] if name in _OWN and (callable(value) or ":" in str(value)) else ""
+                raise ConfigError(f"--{name} {value!r}: unknown; choose one of {', '.join(CHOICES[name])}{own}")
             continue
         if isinstance(default, bool):
             sound, wanted = isinstance(value, bool), "True or False"
@@ -498,6 +499,10 @@ def check_types(config: Config) -> None:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
 
 
+_OWN = {  # what a user who names a function of their own is told
+    "multiplier_update": "; a rule of your own is the constraint of a method row, --method MODULE:ROW",
+    "imitation_reward": "; a reward of your own is the reward of a method row, --method MODULE:ROW",
+}
 _ANY = 0.5  # within the range of every traced field
 
 

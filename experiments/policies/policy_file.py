@@ -13,6 +13,9 @@ import numpy as np
 from ccil_jax.config import CHOICES, Config
 from ccil_jax.demonstrations import npz
 from ccil_jax.demonstrations.npz import ArchiveError
+from envs.lookup import hint
+from envs.registry import TASKS
+from experiments.cli.command_line import UsageError, launcher_command
 from experiments.policies.numpy_policy import CLIP
 
 MAX_LAYERS = 32
@@ -98,10 +101,25 @@ def shipped() -> Path:
     return Path(str(resources.files("experiments"))) / "experts"
 
 
-def find(named: Path) -> Path:
-    """The file itself; or that of a shipped expert, where `named` is the name of its task and no file."""
+def find(named: Path, option: str) -> Path:
+    """The file itself; or that of a shipped expert, where `named` is the name of its task and no file.
+
+    Raises:
+        UsageError: there is no such file, and the name is that of a task whose expert is not shipped, or of none.
+    """
+    if named.exists() or len(named.parts) > 1 or named.suffix:
+        return named
     known = shipped() / f"{named.name}.npz"
-    return known if len(named.parts) == 1 and not named.exists() and known.is_file() else named
+    if known.is_file():
+        return known
+    names = sorted(path.stem for path in shipped().glob("*.npz"))
+    remedy = f"{hint(named.name, names)}correct the path or the name"
+    if named.name in TASKS:
+        train = f"{launcher_command('expert')} --env {named} --out {named}.npz --export {named}_policy.npz"
+        remedy = f"train one with `{train}`"
+    raise UsageError(
+        f"{option} {named}: no such file, and no expert of that name is shipped (shipped: {', '.join(names)}); {remedy}"
+    )
 
 
 def read(path: Path) -> PolicyFile:
