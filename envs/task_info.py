@@ -35,6 +35,8 @@ class TaskInfo:
     expert_preset: str = "expert"  # the hyperparameters that an expert starts from, a key of `ccil_jax.presets.PRESETS`
     original: str | None = None  # the environment that the task is compared with
     original_package: Literal["gymnasium", "safety_gymnasium"] | None = None  # which has that environment
+    # What that environment's reward contains and the task's leaves out, in words; empty where the two are the same.
+    reward_lacks: str = ""
     # Options of that environment which make its observations those of the task.
     original_options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
     # How a report draws an episode: bodies seen from the "side" or from "above", or a map of the whole "arena".

@@ -12,7 +12,7 @@ from ccil_jax.training.progress import Display
 from experiments.cli import xla
 from experiments.cli.command_line import RUN_LOCK
 from experiments.cli.interruption import Interruption
-from experiments.runs import fault_files, run_folder, summary
+from experiments.runs import demonstration_files, fault_files, run_folder, summary
 from experiments.runs.environments import build_environment
 from experiments.runs.metrics_file import read_metrics
 from experiments.runs.plans import ProgramPlan, RunPlan, Setup
@@ -70,6 +70,8 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         ) as display,
         Interruption() as interruption,
     ):
+        if note := demonstration_files.note_on_rewards(setup.demonstrations, setup.task):
+            display.message(f"note: {note}")
         display.message(f"{_announcement(program)}; compiling ...")
         xla.spread_seeds(program.num_runs)
         # This imports JAX, so that it has to wait until the input has been checked.
