@@ -148,8 +148,8 @@ class Config:
     )
     gap_unit: str = _static(
         "cost",
-        "unit of the gap that dual ascent by sgd follows: the cost's own (Algorithm 1), or the limit, so that one "
-        "learning rate suits tasks of any cost",
+        "unit of the gap that dual ascent by sgd follows: the cost's own (Algorithm 1), or the limit (at least "
+        "1), so that one learning rate suits tasks of any cost",
         SGD,
     )
     meta_update: str = _static(
