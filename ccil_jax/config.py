@@ -148,8 +148,8 @@ class Config:
     )
     gap_unit: str = _static(
         "cost",
-        "unit of the gap that dual ascent by sgd follows: the cost's own (Algorithm 1), or the limit, so that one "
-        "learning rate suits tasks of any cost",
+        "unit of the gap that dual ascent by sgd follows: the cost's own (Algorithm 1), or the limit (at least "
+        "1), so that one learning rate suits tasks of any cost",
         SGD,
     )
     meta_update: str = _static(
@@ -478,7 +478,8 @@ def check_types(config: Config) -> None:
         value = getattr(config, name)
         if name in CHOICES:
             if value not in CHOICES[name]:
-                raise ConfigError(f"--{name} {value!r}: unknown; choose one of {', '.join(CHOICES[name])}")
+                own = _OWN[name] if name in _OWN and (callable(value) or ":" in str(value)) else ""
+                raise ConfigError(f"--{name} {value!r}: unknown; choose one of {', '.join(CHOICES[name])}{own}")
             continue
         if isinstance(default, bool):
             sound, wanted = isinstance(value, bool), "True or False"
@@ -498,6 +499,10 @@ def check_types(config: Config) -> None:
             raise ConfigError(f"--{name} {value!r}: give {wanted}")
 
 
+_OWN = {  # what a user who names a function of their own is told
+    "multiplier_update": "; a rule of your own is the constraint of a method row, --method MODULE:ROW",
+    "imitation_reward": "; a reward of your own is the reward of a method row, --method MODULE:ROW",
+}
 _ANY = 0.5  # within the range of every traced field
 
 

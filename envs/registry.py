@@ -31,6 +31,7 @@ def _locomotion(
     quantity: str,
     *,
     contact: bool = False,
+    reward_lacks: str = "",
 ) -> TaskInfo:
     """A row; `contact` says that the cost counts contacts, so that there is a choice to leave them out."""
     return TaskInfo(
@@ -44,10 +45,12 @@ def _locomotion(
         cost=f"{quantity} > {cost_threshold:g}",
         original=f"{name}-v5",
         original_package="gymnasium",
+        reward_lacks=reward_lacks,
         original_options=MappingProxyType({"include_cfrc_ext_in_observation": False} if contact else {}),
     )
 
 
+_CONTROL, _BOTH = "the control cost", "the control cost and the contact cost"
 _HAZARD = "the robot's centre is over a hazard"
 _BUTTON = f"{_HAZARD}, it touches a wrong button or a gremlin"
 
@@ -69,11 +72,21 @@ def _safety_gym(name: str, dims: tuple[int, int], cost: str) -> TaskInfo:
 
 _ROWS = (
     _locomotion("Swimmer", (8, 2), 1.0, 300.0, "planar speed of the head, m/s"),
-    _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions"),
-    _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions"),
+    _locomotion("HalfCheetah", (17, 6), 0.2, 300.0, "0.1 * sum of squared actions", reward_lacks=_CONTROL),
+    _locomotion("Hopper", (11, 3), 1.0, 200.0, "sum of squared actions", reward_lacks=_CONTROL),
     _locomotion("Walker2d", (17, 6), 1.0, 300.0, "absolute forward speed, m/s"),
-    _locomotion("Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost", contact=True),
-    _locomotion("Humanoid", (270, 17), 0.2, 40.0, "0.1 * sum of squared actions + contact cost", contact=True),
+    _locomotion(
+        "Ant", (27, 8), 2.0, 300.0, "0.5 * sum of squared actions + contact cost", contact=True, reward_lacks=_BOTH
+    ),
+    _locomotion(
+        "Humanoid",
+        (270, 17),
+        0.2,
+        40.0,
+        "0.1 * sum of squared actions + contact cost",
+        contact=True,
+        reward_lacks=_BOTH,
+    ),
     _safety_gym("PointGoal1", (60, 2), _HAZARD),
     _safety_gym("PointButton1", (76, 2), _BUTTON),
     _safety_gym("PointPush1", (76, 2), _HAZARD),

@@ -35,6 +35,8 @@ class TaskInfo:
     expert_preset: str = "expert"  # the hyperparameters that an expert starts from, a key of `ccil_jax.presets.PRESETS`
     original: str | None = None  # the environment that the task is compared with
     original_package: Literal["gymnasium", "safety_gymnasium"] | None = None  # which has that environment
+    # What that environment's reward contains and the task's leaves out, in words; empty where the two are the same.
+    reward_lacks: str = ""
     # Options of that environment which make its observations those of the task.
     original_options: Mapping[str, Any] = dataclasses.field(default_factory=_nothing)
 
@@ -55,9 +57,10 @@ class TaskInfo:
         build = named_object(self.build) if isinstance(self.build, str) else self.build
         env = build(**arguments)
         if missing := [member for member in _MEMBERS if not hasattr(env, member)]:
+            of_brax = hasattr(env, "observation_size") and hasattr(env, "action_size")
             raise ValueError(
                 f"{self.name}: what was built, a {type(env).__name__}, has no {', '.join(missing)}; "
-                "return an envs.Environment"
+                f"return an envs.Environment{' (wrap it in envs.FromBrax)' if of_brax else ''}"
             )
         for member in ("obs_dim", "action_dim"):
             wanted, found = getattr(self, member), getattr(env, member)

@@ -81,6 +81,8 @@ def run(arguments: argparse.Namespace) -> None:
     except OSError as error:
         raise UsageError(f"--out {out}: cannot be written ({error.strerror}); make space or choose another") from None
     print(_summary(demonstrations, out))
+    if note := demonstration_files.note_on_rewards(demonstrations, task.name):
+        print(f"note: {note}")
 
 
 def _summary(demonstrations: Demonstrations, out: Path) -> str:

@@ -138,6 +138,7 @@ def run(arguments: argparse.Namespace) -> None:
     unit = "steps" if arguments.simulator == "ours" else "episodes"
     with waiting.progress("evaluating", unit) as on_progress:
         episodes = evaluating.play(loaded, settings, on_progress)
+    print("evaluating the random policy ...", file=sys.stderr, flush=True)
     content, reference = evaluating.judge(loaded, settings, episodes)
     _export(arguments, loaded, episodes, settings)
     if arguments.record:

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     if not arguments.runs and not arguments.policies:
         raise UsageError("RUN_DIR: give at least one folder of a run, or --policies FILE.npz")
     entries = read_entries(arguments.runs)
-    files = [policy_file.read(policy_file.find(path)) for path in arguments.policies]
+    files = [policy_file.read(policy_file.find(path, "--policies")) for path in arguments.policies]
     path = arguments.out or (arguments.runs[0] if len(entries) == 1 else Path()) / "report.html"
     command_line.check_new_file(path, "--out", overwrite=arguments.overwrite or document.is_page(path))
     command_line.check_writable(path.parent, "--out")

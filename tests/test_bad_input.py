@@ -154,6 +154,19 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "evaluate what": (("evaluate",), "RUN_DIR: give the folder of a run, or --policy FILE.npz; one of the two"),
     "evaluate two": (("evaluate", "done", "--policy", "good.npz"), "RUN_DIR: give the folder of a run, or --policy"),
     "evaluate no policy": (("evaluate", "--policy", "none.npz"), "none.npz: no such file; check the path"),
+    "evaluate an expert that is not shipped": (
+        ("evaluate", "--policy", "Ant"),
+        "--policy Ant: no such file, and no expert of that name is shipped (shipped: CarGoal1, HalfCheetah, Hopper,",
+    ),
+    "evaluate an unknown expert": (("evaluate", "--policy", "Hoper"), "did you mean Hopper? correct the path or the"),
+    "show an expert that is not shipped": (
+        ("report", "--policies", "Ant", "--out", "new.html"),
+        "train one with `python -m experiments.expert --env Ant --out Ant.npz --export Ant_policy.npz`",
+    ),
+    "a rule of the multiplier of one's own": (
+        ("train", "--method", "ccil", "--env", "Swimmer", "--multiplier-update", "my_methods:rule"),
+        "sgd, pid, optimal; a rule of your own is the constraint of a method row, --method MODULE:ROW",
+    ),
     "evaluate demonstrations": (("evaluate", "--policy", "good.npz"), "good.npz: key 'kernel_0' is missing; write the"),
     "evaluate nothing": (("evaluate", "none"), "RUN_DIR none: no such folder"),
     "evaluate something else": (("evaluate", "full"), "full/config.json: cannot be read"),

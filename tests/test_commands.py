@@ -39,9 +39,15 @@ PLACEHOLDERS = {  # words of the pages that a reader replaces, or whose file is 
     "J": "2",
     "P": "mjx",
     "minari:mujoco/hopper/expert-v0": "FILE",  # which the page downloads first
+    "minari:cheetah/random-v0": "FILE",  # which the page records first
 }
 OTHERS = ("export", "mkdir", "minari", "tensorboard")  # programs that are not ours
-PYTHON_IS_RUN = {"README.md": "below", "docs/extending.md": "test_extending.py"}
+PYTHON_IS_RUN = {
+    "README.md": "below",
+    "docs/commands.md": "test_policy_file.py",
+    "docs/demonstrations.md": "test_exchange.py",
+    "docs/extending.md": "test_extending.py",
+}
 WRONG = (AssertionError, ImportError, LookupError, SyntaxError, SystemExit, UserError)  # how a command may fail
 TINY = ["--preset", "tiny", "--num-seeds", "1", "--eval-episodes", "2"]
 

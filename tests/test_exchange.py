@@ -21,9 +21,10 @@ from ccil_jax.training.filesystem import content_sha256
 from envs.registry import TASKS
 from experiments import convert, evaluate, train
 from experiments.cli.command_line import UsageError
-from experiments.runs import resuming
+from experiments.runs import demonstration_files, resuming
 from experiments.runs.run_log import write_config
 from experiments.sweeps import variants
+from tests.test_commands import blocks
 
 ENDS = np.array([3, 7, 9])
 FINAL_OBS = np.random.default_rng(1).normal(size=(3, 8)).astype(np.float32)
@@ -139,6 +140,31 @@ def test_a_dataset_that_minari_made_is_found_by_its_name(local: Path, tmp_path: 
     assert variants.make_variant("x", fields, tmp_path / "sweep").plan.setup == setup
     assert convert.main([name, "--env", "Swimmer", "--out", str(tmp_path / "own.npz")]) == 0
     assert_same(load_demonstrations(tmp_path / "own.npz"), wanted)
+
+
+@pytest.mark.usefixtures("local")
+def test_the_page_records_a_dataset_with_costs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By gymnasium and Minari alone. Its reward has a control cost, which our task's has not, and that is said."""
+    (block,), page = blocks("docs/demonstrations.md", "python"), dict[str, Any]()
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes to a log file about an attribute of gymnasium's model
+    with warnings.catch_warnings():  # about an author and the like, and about Minari's temporary folders
+        warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("ignore", ResourceWarning)
+        exec(compile(block, "docs/demonstrations.md", "exec"), page)  # noqa: S102  (the page is ours)
+        page.pop("env")._tmp_dir.cleanup()
+    name, note = "minari:cheetah/random-v0", "the demonstrations are of HalfCheetah-v5, whose reward contains the con"
+    found: Any = load_demonstrations(name)
+    np.testing.assert_array_equal(found.costs, 0.1 * np.square(found.actions.astype(float)).sum(axis=1) > 0.2)
+    np.testing.assert_array_equal(found.episode_lengths, [1000, 1000])
+    assert 0 < found.costs.mean() < 1
+    assert convert.main([name, "--env", "HalfCheetah", "--out", str(tmp_path / "own.npz")]) == 0
+    assert f"note: {note}" in capsys.readouterr().out
+    assert note in (demonstration_files.note_on_rewards(load_demonstrations(tmp_path / "own.npz"), "HalfCheetah") or "")
+    assert demonstration_files.note_on_rewards(make(metadata={"environment": "Swimmer-v5"}), "Swimmer") is None
+    assert demonstration_files.note_on_rewards(make(metadata={"environment": "ccil/Hopper-v0"}), "Hopper") is None
+    assert demonstration_files.note_on_rewards(None, "Hopper") is None
 
 
 def test_a_task_that_gymnasium_does_not_know_has_no_environment(local: Path) -> None:

@@ -30,21 +30,22 @@ from ccil_jax.methods import _BUILT_IN, Method, _checked, _methods
 from envs import registry
 from envs.locomotion import LocomotionTask
 from envs.testing import check_environment
+from experiments import train
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
 PAGE = Path(__file__).parent.parent / "docs" / "extending.md"
+BLOCKS = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
 @pytest.fixture(scope="module")
 def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """What the page's program has defined. Its registrations are undone afterwards."""
-    blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     namespace: dict[str, Any] = {"__name__": "extending"}
     kept = {name: dict(table) for name, table in (("tasks", registry._tasks), ("methods", _methods))}
     kept_formats = list(formats.FORMATS)
     with pytest.MonkeyPatch.context() as patched, quick_compilation():
         patched.chdir(tmp_path_factory.mktemp("page"))
-        for block in blocks:
+        for block in BLOCKS:
             with warnings.catch_warnings():
                 if "import brax" in block:  # which warns of itself and of what it imports
                     warnings.simplefilter("ignore")
@@ -58,7 +59,6 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_the_tasks_keep_their_promises(names: dict[str, Any]) -> None:
-    check_environment(names["env"])
     check_environment(names["careful"])
     check_environment(names["balancing"])
     check_environment(names["sliding"])
@@ -127,7 +127,8 @@ def test_what_the_page_imports_is_part_of_the_api() -> None:
 
 @pytest.mark.filterwarnings("ignore:Accessing `ncon`:DeprecationWarning")  # Brax's own use of MJX
 def test_an_environment_of_brax_has_the_cost_of_the_page(names: dict[str, Any]) -> None:
-    env = names["pendulum_of_brax"]
+    env = names["brax_env"]
+    assert env.max_episode_steps == 100
     state = jax.eval_shape(env.step, jax.eval_shape(env.reset, jax.random.key(0)), jnp.zeros(1))
     assert (state.cost.shape, state.obs.shape) == ((), (4,))
     shown = [types.SimpleNamespace(obs=jnp.array([place, 0.0, 0.0, 0.0])) for place in (0.05, -0.2)]
@@ -358,6 +359,29 @@ def test_the_rows_of_the_package_name_all_that_the_tables_have() -> None:
         # A configuration chooses between the rewards of a row with a discriminator.
         chosen = set(CHOICES["imitation_reward"]) if column == "reward" else set()
         assert {getattr(row, column) for row in _BUILT_IN} - {None} | chosen == set(table)
+
+
+def test_the_rule_of_the_page_is_an_option_of_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: dict[str, Any]
+) -> None:
+    """The rule and its row in a file, as the page says; other rules of the multiplier are no option of this method."""
+    found = {key: block for block in BLOCKS for key in ("def leaky", "LEAKY = ") if key in block}
+    rule, row = found["def leaky"].partition("\n\nagent =")[0], found["LEAKY = "]
+    (tmp_path / "my_methods.py").write_text(f"import jax.numpy as jnp\nimport ccil_jax\n{rule}\n{row}")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    given = ["--method", "my_methods:LEAKY", "--env", "Swimmer", "--initial-multiplier", "0.1", "--out", "run"]
+    try:
+        config = train.make_plan(train.make_parser().parse_args(given)).config
+        maker: Any = config.row.constraint
+        built = maker(config)
+        assert built.multiplier(built.init()) == np.float32(0.1)
+        with pytest.raises(ConfigError, match="multiplier_update adam: makes no difference to this run of method my_m"):
+            train.make_plan(train.make_parser().parse_args([*given, "--multiplier-update", "adam"]))
+        assert ccil_jax.Config.from_preset("default", method="ccil").initial_multiplier == 0  # as the page says
+    finally:
+        _methods.pop("my_methods:LEAKY", None)
+        sys.modules.pop("my_methods", None)
 
 
 def test_a_method_is_found_by_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

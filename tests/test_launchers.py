@@ -305,7 +305,7 @@ def test_the_limit_is_that_of_the_method(method: str, limit: float | None) -> No
 def test_exported_policies_are_the_learnt_ones(
     pipeline: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """1,000 observations: the program to the last bit, the NumPy arrays to 1e-5."""
+    """1,000 observations: the program to the last bit, the NumPy arrays to 1e-5, actions as they are executed."""
     import jax
     import jax.numpy as jnp
 
@@ -333,7 +333,7 @@ def test_exported_policies_are_the_learnt_ones(
     def learnt(obs: jax.Array, noise: jax.Array) -> jax.Array:
         return jax.vmap(lambda actor: act(policy.apply, actor, obs, noise))(loaded.actor)
 
-    expected = np.asarray(learnt(jnp.asarray(obs), jnp.asarray(noise)))
+    expected = np.asarray(learnt(jnp.asarray(obs), jnp.asarray(noise))).clip(env.action_low, env.action_high)
     assert expected.shape == (2, 1000, env.action_dim)
     np.testing.assert_array_equal(program.call(obs, noise), expected)
     assert program.call(obs[:7], noise[:7]).shape == (2, 7, env.action_dim)
@@ -342,6 +342,7 @@ def test_exported_policies_are_the_learnt_ones(
     np.testing.assert_allclose(modes, program.call(obs, 0 * noise), rtol=0, atol=1e-5)
     with np.load(files[0], allow_pickle=False) as arrays:
         assert arrays["kernel_0"].shape == (2, env.obs_dim, *stored.config.hidden_sizes[:1])
+        np.testing.assert_array_equal(arrays["action_high"], np.broadcast_to(env.action_high, (2, env.action_dim)))
 
     with pytest.raises(SystemExit) as end:
         evaluate.main([f"{pipeline}/malm", "--export", "policy.pt"])

@@ -64,18 +64,19 @@ def reference(name: str) -> dict[str, Any]:
     contacts = 0
     for (qpos, qvel), action in zip(states, actions, strict=True):
         put(original, qpos, qvel)
-        obs, _, terminated, _, info = original.step(action)
+        obs, reward, terminated, _, info = original.step(action)
         contacts += original.data.ncon > 0
-        original_steps.append((obs, terminated, info))
+        original_steps.append((obs, reward, terminated, info))
     if name != "Swimmer":
         assert contacts > NUM_STATES // 10
     return {
         "qpos": np.stack([qpos for qpos, _ in states]),
         "qvel": np.stack([qvel for _, qvel in states]),
         "actions": actions,
-        "obs": np.stack([obs for obs, _, _ in original_steps]),
-        "terminated": np.array([terminated for _, terminated, _ in original_steps]),
-        "infos": [info for _, _, info in original_steps],
+        "obs": np.stack([obs for obs, *_ in original_steps]),
+        "rewards": np.array([reward for _, reward, *_ in original_steps]),
+        "terminated": np.array([terminated for *_, terminated, _ in original_steps]),
+        "infos": [info for *_, info in original_steps],
         "dt": original.dt,
     }
 
@@ -141,6 +142,16 @@ def test_native_step_equals_gymnasium(name: str) -> None:
     quantity = np.array([independent_cost(name, i, a) for i, a in zip(infos, expected["actions"], strict=True)])
     np.testing.assert_array_equal(state.cost, quantity > env.cost_threshold)
     assert 0 < state.cost.mean() < 1
+
+
+@pytest.mark.parametrize("name", LOCOMOTION)
+def test_a_task_says_what_its_reward_lacks_of_gymnasiums(name: str) -> None:
+    expected, lacks = reference(name), envs.TASKS[name].reward_lacks
+    ours = np.array([independent_reward(name, info) for info in expected["infos"]])
+    left_out = [TERMS[term] for term in ("control", "contact") if term in lacks]
+    terms = sum(np.array([info[key] for info in expected["infos"]]) for key in left_out)
+    np.testing.assert_allclose(expected["rewards"], ours + terms, rtol=1e-9, atol=1e-9)
+    assert bool(lacks) == (not np.allclose(expected["rewards"], ours))
 
 
 @pytest.mark.parametrize("name", LOCOMOTION)

@@ -1,6 +1,7 @@
 """Files of policies: what is written is read again, and what is damaged or hostile is refused in one line."""
 
 import json
+import types
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from ccil_jax.demonstrations.npz import ArchiveError
 from experiments.page import document, episodes
 from experiments.policies import policy_file
 from experiments.policies.numpy_policy import policies
+from tests.test_commands import blocks
+from tests.test_documentation import ROOT
 
 TRAINING: dict[str, Any] = {
     "task": "Swimmer",
@@ -68,39 +71,95 @@ def test_policies_of_a_file_act_as_its_arrays_say(tmp_path: Path) -> None:
     policy, actor, noise = networks.policy_of(file.config, env), file.actor(), np.ones((6, 2))
     found = jax.vmap(lambda one: act(policy.apply, one, jnp.asarray(obs, jnp.float32), jnp.asarray(noise)))(actor)
     np.testing.assert_allclose(found, mean + arrays["action_std"][:, None], rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(policies(file.config, actor, env)[1].mode(obs[0]), mean[1, 0], rtol=1e-4, atol=1e-4)
+    modes = np.stack([policies(file.config, actor, env)[1].mode(x) for x in obs])
+    np.testing.assert_allclose(modes, np.clip(mean[1], -1, 1), rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("squashed", [False, True])
-@pytest.mark.parametrize("activation", ["tanh", "relu", "swish"])
-def test_onnx_acts_as_the_policies_do(tmp_path: Path, squashed: bool, activation: str) -> None:
-    """1,000 observations, with noise and without: the model in its own runtime against JAX."""
+BOUNDS = {
+    "of one": ([-1.0, -1.0], [1.0, 1.0]),
+    "of each entry": ([-2.0, 0.1], [0.25, 3.0]),
+    "on one side": ([-np.inf, -0.5], [np.inf, np.inf]),
+    "none": ([-np.inf, -np.inf], [np.inf, np.inf]),
+}
+
+
+@pytest.mark.parametrize(
+    ("activation", "squashed", "bounds"),
+    [
+        ("tanh", False, "of one"),
+        ("tanh", False, "none"),
+        ("relu", False, "of each entry"),
+        ("swish", False, "on one side"),
+        ("tanh", True, "of each entry"),
+        ("relu", True, "of one"),
+        ("swish", True, "of each entry"),
+    ],
+)
+def test_exports_give_the_actions_that_are_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, activation: str, squashed: bool, bounds: str
+) -> None:
+    """1,000 observations, with noise so large that many actions are clipped, and without: in each of the three forms.
+
+    The oracle is the policy in JAX, whose actions NumPy clips. What the page shows does the same.
+    """
     import jax
     import jax.numpy as jnp
     import onnxruntime
 
-    import envs
     from ccil_jax.acting import networks
     from ccil_jax.acting.rollout import act
     from experiments.policies import exporting
 
+    monkeypatch.chdir(tmp_path)
     random = np.random.default_rng(1)
+    low, high = (np.array(bound, np.float32) for bound in BOUNDS[bounds])
+    env = types.SimpleNamespace(name="Boxed", obs_dim=8, action_dim=2, action_low=low, action_high=high)
     other = {"kernel_1": random.normal(size=(2, 5, 4)), "bias_1": random.normal(size=(2, 4)), "action_std": None}
     other |= {"action_center": np.zeros((2, 2)), "action_half_range": np.ones((2, 2)), "obs_clip": np.full(2, np.inf)}
     other |= {"obs_mean": np.zeros((2, 8)), "obs_std": np.ones((2, 8))}
-    path, env = tmp_path / "policy.npz", envs.make("Swimmer")
-    npz.write(path, content(metadata={**METADATA, "activation": activation}, **(other if squashed else {})))
-    file = policy_file.read(path)
-    actor = file.actor()
-    exporting.export_onnx(tmp_path / "policy.onnx", file.config, actor, env)
-    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
-    obs = random.normal(size=(1000, 8)).astype(np.float32) * 3
-    policy = networks.policy_of(file.config, env)
-    for noise in (np.zeros((1000, 2), np.float32), random.normal(size=(1000, 2)).astype(np.float32)):
+    npz.write(Path("made.npz"), content(metadata={**METADATA, "activation": activation}, **(other if squashed else {})))
+    file = policy_file.read(Path("made.npz"))
+    actor, played = file.actor(), types.SimpleNamespace(episode_return=np.zeros((2, 3)), episode_cost=np.ones((2, 3)))
+    exporting.export_numpy(Path("policy.npz"), file.config, actor, env, played, METADATA)
+    exporting.export_onnx(Path("policy.onnx"), file.config, actor, env)
+    exporting.export_stablehlo(Path("policy.stablehlo"), file.config, actor, env)
+    assert policy_file.read(Path("policy.npz")).squashed == squashed
+
+    session = onnxruntime.InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
+    program = jax.export.deserialize(bytearray(Path("policy.stablehlo").read_bytes()))
+    policy, obs = networks.policy_of(file.config, env), random.normal(size=(1000, 8)).astype(np.float32) * 3
+    for noise in (np.zeros((1000, 2), np.float32), random.normal(size=(1000, 2)).astype(np.float32) * 3):
+        drawn = jax.vmap(lambda one, noise=noise: act(policy.apply, one, jnp.asarray(obs), jnp.asarray(noise)))(actor)
+        wanted = np.clip(drawn, low, high)
+        assert squashed or bounds == "none" or np.mean(wanted != drawn) > 0.2
         (found,) = session.run(["action"], {"obs": obs, "noise": noise})
-        wanted = jax.vmap(lambda one, noise=noise: act(policy.apply, one, jnp.asarray(obs), jnp.asarray(noise)))(actor)
         assert found.shape == (2, 1000, 2)
         np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(program.call(obs, noise), wanted, rtol=1e-5, atol=1e-5)
+        assert (found >= low).all()
+        assert (found <= high).all()
+    if activation == "tanh" and not squashed:
+        check_the_page(obs, noise, wanted)
+
+
+def check_the_page(obs: np.ndarray, noise: np.ndarray, wanted: np.ndarray) -> None:
+    """The Python of docs/commands.md, with the files in the current folder, acts as the policies do."""
+    page: dict[str, Any] = {}
+    for block in blocks("docs/commands.md", "python"):
+        exec(compile(block, "docs/commands.md", "exec"), page)  # noqa: S102  (the page is ours)
+    np.testing.assert_allclose(page["act"](obs, noise), wanted[0], rtol=1e-4, atol=1e-4)
+    assert page["actions"].shape == (2, 3, 2)
+    np.testing.assert_allclose(page["actions"], page["same_actions"], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(page["actions"][0], page["act"](page["obs"], page["noise"]), rtol=1e-4, atol=1e-4)
+
+
+def test_the_arrays_of_a_policy_are_those_of_the_page() -> None:
+    """Every array that is read is in the table of docs/commands.md."""
+    page = (ROOT / "docs/commands.md").read_text(encoding="utf-8")
+    table = page.partition("| array | shape | meaning |")[2].partition("\n\n")[0]
+    optional = {"action_center", "action_half_range", "action_low", "action_high", "episode_return", "episode_cost"}
+    for name in (content().keys() | optional) - {"bias_1"}:
+        assert f"`{name}`" in table
 
 
 def without(*keys: str) -> dict[str, Any]:
@@ -120,6 +179,10 @@ def without(*keys: str) -> dict[str, Any]:
         ({"obs_clip": np.full(2, 10.0)}, "do not make up a policy"),
         ({"kernel_0": np.zeros((0, 8, 5))}, "do not make up a policy"),
         ({"episode_cost": np.zeros(2)}, "do not make up a policy"),
+        ({"action_low": np.zeros((2, 2))}, "do not make up a policy"),  # without the other bound
+        ({"action_low": np.ones((2, 2)), "action_high": np.zeros((2, 2))}, "do not make up a policy"),
+        ({"action_low": np.zeros((2, 3)), "action_high": np.ones((2, 3))}, "do not make up a policy"),
+        ({"action_low": np.zeros((2, 2)), "action_high": np.full((2, 2), np.nan)}, "do not make up a policy"),
         ({"obs_clip": None}, "key 'obs_clip' is missing"),
         ({"bias_1": np.full((2, 2), np.nan)}, "'bias_1' holds something else than finite numbers"),
         ({"bias_1": np.full((2, 2), "a")}, "'bias_1' holds something else than finite numbers"),

@@ -1,6 +1,7 @@
 """What comes with the package: demonstrations and the policies of their experts, whole and of the tasks they name."""
 
 import hashlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from ccil_jax.demonstrations.trajectories import check_matches, load_demonstrations
 from envs.registry import TASKS
 from experiments.policies import policy_file
+from tests.test_documentation import ROOT
 
 FOLDER = Path(policy_file.__file__).parents[1]
 DEMONSTRATIONS = sorted((FOLDER / "demonstrations").glob("*.npz"))
@@ -21,6 +23,12 @@ def name_of(path: Path) -> str:
 
 def test_every_demonstrator_is_there_too() -> None:
     assert [path.name for path in DEMONSTRATIONS] == [path.name for path in EXPERTS]
+
+
+def test_the_table_of_experts_has_the_shipped_ones_in_bold() -> None:
+    """The README and other pages refer to it in the place of a list."""
+    page = (ROOT / "docs" / "tasks.md").read_text(encoding="utf-8").partition("\n## Experts\n")[2]
+    assert sorted(re.findall(r"^\| \*\*(\w+)\*\* ", page, re.MULTILINE)) == [path.stem for path in EXPERTS]
 
 
 def test_every_file_has_the_checksum_of_the_list() -> None:

@@ -116,11 +116,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         assert train.main(["--env", TASK, "--method", "ccil", "--demos", "expert.npz", "--out", "run", *TINY]) == 0
         yield folder
     sys.modules.pop("my_task", None)
-    _methods.pop("my_task:LINEAR", None)
+    sys.modules.pop("broken_tasks", None)
+    for name in ("my_task:LINEAR", "broken_tasks:RULE"):
+        _methods.pop(name, None)
 
 
 BROKEN = """
 import jax.numpy as jnp
+import ccil_jax
+import envs
 from my_task import Cart
 
 
@@ -155,6 +159,21 @@ class Unlicensed(Cart):
 
 class Empty:
     pass
+
+
+class LikeBrax(Empty):
+    observation_size, action_size = 2, 1
+
+
+def costly():
+    return envs.with_cost(Cart(10), lambda before, action, after: action)
+
+
+def rule(config):
+    return ccil_jax.Constraint(combine=lambda multiplier, step_gap, gram: jnp.ones(3))
+
+
+RULE = ccil_jax.Method(reward="discriminator", constraint=rule, limit="demonstrations")
 """
 
 
@@ -167,13 +186,37 @@ class Empty:
         ("Silent", "step returned NoneType; return an envs.State"),
         ("Wrong", r"step: broken_tasks.py, line \d+, raised AttributeError: .*; correct that function"),
         ("Unlicensed", r"broken_tasks.py, line \d+, raised RuntimeError: no licence"),
-        ("Empty", "has no name, obs_dim, .*; return an envs.Environment"),
+        ("Empty", "has no name, obs_dim, .*; return an envs.Environment$"),
+        ("LikeBrax", r"has no name, obs_dim, .*; return an envs.Environment \(wrap it in envs.FromBrax\)$"),
+        ("costly", r"Cart: cost must have shape \(\), but has shape \(1,\)"),
     ],
 )
 def test_a_task_that_breaks_its_promises_is_one_line(folder: Path, task: str, message: str) -> None:
     (folder / "broken_tasks.py").write_text(BROKEN, encoding="utf-8")
     with pytest.raises(UserError, match=rf"env broken_tasks:{task}: (.*\W)?{message}"):
         build_environment(f"broken_tasks:{task}", "auto", {})
+
+
+def test_a_run_that_fails_before_its_first_iteration_does_not_block_its_folder(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The corrected command may write there; once an iteration is done, or a stranger's file lies there, no more."""
+    (folder / "broken_tasks.py").write_text(BROKEN, encoding="utf-8")
+    given = ["--env", TASK, "--method", "broken_tasks:RULE", "--demos", "expert.npz", "--out", "failed", *TINY]
+    assert "combine: returned an array of shape (3,)" in refused(capsys, train, *given, lines=2)
+    assert Path("failed/config.json").is_file()
+    arguments = train.make_parser().parse_args(given)
+    assert train.make_plan(arguments).folder == Path("failed")
+    for name in ("notes.txt", "checkpoints/120/data", "metrics.csv"):
+        file = Path("failed", name)
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("something")
+        with pytest.raises(UserError, match="--out failed: already holds a run; continue it with --resume"):
+            train.make_plan(arguments)
+        file.unlink()
+        if file.parent.name == "120":
+            file.parent.rmdir()
+    assert train.make_plan(arguments).folder == Path("failed")
 
 
 def test_another_folder_does_not_know_the_method_but_the_run_is_whole(
@@ -187,13 +230,13 @@ def test_another_folder_does_not_know_the_method_but_the_run_is_whole(
     assert "damaged" not in said
 
 
-def refused(capsys: pytest.CaptureFixture[str], launcher: Any, *arguments: str) -> str:
-    """The one line of a launcher that refuses its arguments."""
+def refused(capsys: pytest.CaptureFixture[str], launcher: Any, *arguments: str, lines: int = 1) -> str:
+    """The one line of a launcher that refuses its arguments; `lines` counts those before it too."""
     with pytest.raises(SystemExit) as end:
         launcher.main(list(arguments))
     assert end.value.code == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1
+    assert said.count("\n") == lines
     return said
 
 

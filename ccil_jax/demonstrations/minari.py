@@ -36,7 +36,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def _facts(path: Path) -> dict[str, str]:
-    """Name and version of the dataset, where the folder has them."""
+    """Name and version of the dataset, and the `environment` that it was recorded in, where the folder has them."""
     if not path.exists():
         return {}
     try:
@@ -45,11 +45,20 @@ def _facts(path: Path) -> dict[str, str]:
         facts = json.loads(path.read_text(encoding="utf-8-sig"))
         if not isinstance(facts, dict):
             raise TypeError("not an object")
-        return {key: str(facts[key])[:200] for key in ("dataset_id", "minari_version") if key in facts}
+        named = {key: facts[key] for key in ("dataset_id", "minari_version") if key in facts}
+        return {key: str(value)[:200] for key, value in (named | _environment(facts.get("env_spec"))).items()}
     except (OSError, ValueError, TypeError, RecursionError):
         raise ArchiveError(
             f"{path}: not a JSON object of at most {npz.MAX_METADATA_BYTES} bytes; copy it again"
         ) from None
+
+
+def _environment(spec: Any) -> dict[str, Any]:
+    """The name of the environment in gymnasium's description of it, a JSON text; nothing where there is none."""
+    try:
+        return {"environment": json.loads(spec)["id"]}
+    except (ValueError, TypeError, LookupError, RecursionError):
+        return {}
 
 
 def holds_episodes(found: Mapping[str, np.ndarray]) -> bool:

@@ -20,6 +20,7 @@ from ccil_jax.training.filesystem import DISK_IS_FULL, unfit_for_checkpoints
 from experiments.cli import xla
 from experiments.cli.names import safe_name
 
+RUN_LOCK = ".run.lock"  # in the folder of a run's checkpoints: made when the run begins, and left there
 CONSOLE = "ccil"  # the command that comes with an installation; `experiments.cli.console` carries it out
 MAX_ERROR = 1000  # length of an error message in characters; it may quote a file, which may be long
 
@@ -182,22 +183,39 @@ def check_output_folder(
 
     Raises:
         UsageError: the folder holds another run or other files, or none that could be resumed, or cannot be written.
+            A run that ended before its first iteration does not count, since nothing would be lost.
     """
     try:
         holds_run = (folder / record).is_file()
         # Files whose names begin with a dot are locks and temporary files of a process that was killed at its start.
         occupied = folder.is_dir() and any(path for path in folder.rglob("*") if not _is_left_over(path))
+        did_nothing = holds_run and not resume and _did_nothing(folder)
     except OSError as error:
         raise UsageError(f"{option} {folder}: cannot be read ({error.strerror}); choose another folder") from None
     if resume and not holds_run:
         raise UsageError(f"--resume: {folder} holds no run (no {record}); leave --resume out or correct {option}")
-    if holds_run and not resume:
+    if holds_run and not resume and not did_nothing:
         raise UsageError(f"{option} {folder}: already holds a run; continue it with --resume or choose another folder")
-    if occupied and not resume:
+    if occupied and not resume and not did_nothing:
         raise UsageError(f"{option} {folder}: not empty; choose a new folder")
     if complaint := unfit_for_checkpoints(folder):
         raise UsageError(f"{option} {folder}: {complaint}")
     check_writable(folder, option)
+
+
+def _did_nothing(folder: Path) -> bool:
+    """Whether a run in `folder` ended before its first iteration, as where a function of the user's own is wrong.
+
+    Such a run leaves no more than the files that every run begins with.
+    """
+    begun = (folder / "checkpoints" / RUN_LOCK).is_file()
+    left = [path for place in (folder, folder / "checkpoints") for path in place.glob("*") if not _is_left_over(path)]
+    return begun and all(
+        path.name in ("config.json", "wandb")
+        or path.name.startswith("events.")
+        or (path.name == "metrics.csv" and path.stat().st_size == 0)
+        for path in left
+    )
 
 
 def _is_left_over(path: Path) -> bool:

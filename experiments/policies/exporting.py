@@ -1,5 +1,6 @@
 """Files of learnt policies for other programs: NumPy arrays, an ONNX model, or a StableHLO program."""
 
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -46,7 +47,8 @@ def export_onnx(path: Path, config: Config, actor: Any, env: Any) -> None:
     """Writes the policies of all seeds, with their parameters, as one ONNX model for any number N of observations.
 
     Its inputs are `obs` [N, obs_dim] and standard normal `noise` [N, action_dim], float32; zero noise gives the mode.
-    Its output is `action` [num_seeds, N, action_dim], not yet clipped to the task's range. Needs the package `onnx`.
+    Its output is `action` [num_seeds, N, action_dim] as it is executed, clipped to the task's bounds. Needs the package
+    `onnx`.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -76,9 +78,13 @@ def export_onnx(path: Path, config: Config, actor: Any, env: Any) -> None:
         if i < depth - 1:
             x = _activated(config.activation, x, node)
     if "action_std" in arrays:
-        node("Add", x, node("Mul", wide("action_std"), "noise"), output="action")
+        x = node("Add", x, node("Mul", wide("action_std"), "noise"))
     else:
-        _squash(x, env.action_dim, node, constant, wide)
+        x = _squashed(x, env.action_dim, node, constant, wide)
+    # ONNX's Clip has one bound for all entries. An infinite bound leaves the actions as they are.
+    x = node("Max", x, wide("action_low")) if np.isfinite(arrays["action_low"]).any() else x
+    x = node("Min", x, wide("action_high")) if np.isfinite(arrays["action_high"]).any() else x
+    node("Identity", x, output="action")
     obs_dim, action_dim = arrays["kernel_0"].shape[1], env.action_dim
     graph = helper.make_graph(
         nodes,
@@ -104,9 +110,9 @@ def _activated(activation: str, x: str, node: Node) -> str:
     return node({"tanh": "Tanh", "relu": "Relu"}[activation], x)
 
 
-def _squash(
+def _squashed(
     x: str, action_dim: int, node: Node, constant: Callable[[str, Any], str], wide: Callable[[str], str]
-) -> None:
+) -> str:
     """center + half_range tanh(mean + std noise); x holds the means, then what becomes the log-deviations."""
     smallest, largest = LOG_STD_RANGE
     # Products with halves of the identity take the two parts of x.
@@ -116,7 +122,7 @@ def _squash(
     scaled = node("Mul", share, constant("half_span", np.full(1, (largest - smallest) / 2)))
     std = node("Exp", node("Add", scaled, constant("smallest", np.full(1, smallest))))
     unit = node("Tanh", node("Add", mean, node("Mul", std, "noise")))
-    node("Add", wide("action_center"), node("Mul", wide("action_half_range"), unit), output="action")
+    return node("Add", wide("action_center"), node("Mul", wide("action_half_range"), unit))
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -137,11 +143,12 @@ def export_stablehlo(path: Path, config: Config, actor: Any, env: Any) -> None:
 
     from ccil_jax.acting import networks
     from ccil_jax.acting.rollout import act
+    from envs.base import executed
 
-    policy = networks.policy_of(config, env)
+    policy, clipped = networks.policy_of(config, env), jax.vmap(functools.partial(executed, env))
 
     def actions(obs: jax.Array, noise: jax.Array) -> jax.Array:
-        return jax.vmap(lambda one: act(policy.apply, one, obs, noise))(actor)
+        return jax.vmap(lambda one: clipped(act(policy.apply, one, obs, noise)))(actor)
 
     (num_samples,) = jax.export.symbolic_shape("N")
     shapes = [jax.ShapeDtypeStruct((num_samples, width), np.float32) for width in (env.obs_dim, env.action_dim)]

@@ -29,10 +29,10 @@ class NumpyPolicy:
     Args:
         config: of the policy.
         actor: the seed's `ccil_jax.acting.rollout.Actor`, without a seed axis.
-        low: lower bounds of the actions, [action_dim].
-        high: upper bounds of the actions, [action_dim].
+        low: lower bounds of the actions, [action_dim], which may be infinite.
+        high: upper bounds of the actions, [action_dim], which may be infinite.
 
-    The actions of a squashed policy (IQ-Learn) lie between the bounds; those of a Gaussian one have to be clipped.
+    Actions are returned as they are executed, clipped to these bounds.
     """
 
     def __init__(self, config: Config, actor: Any, low: np.ndarray, high: np.ndarray) -> None:
@@ -50,28 +50,35 @@ class NumpyPolicy:
             self._mean = np.asarray(statistics.mean, np.float64)
             variance = np.asarray(statistics.sum_squares, np.float64) / max(count, 1.0)
             self._std = np.maximum(np.sqrt(variance), _MIN_STD) if count > 0 else np.ones_like(variance)
-        self._center, self._half_range = (low + high) / 2, (high - low) / 2
-        if not self._squashed:
+        self._low, self._high = low, high
+        if self._squashed:
+            self._center, self._half_range = (low + high) / 2, (high - low) / 2
+        else:
             self._log_std = np.asarray(actor.policy_params["log_std"], np.float64)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays from which another program can compute the policy; `tests/golden/run_policy.py` is an example."""
+        """The arrays from which another program can compute the policy, as docs/commands.md describes it."""
         layers = {f"{name}_{i}": x for i, pair in enumerate(self._layers) for name, x in zip(_LAYER, pair, strict=True)}
         if self._squashed:
             last = {"action_center": self._center, "action_half_range": self._half_range}
         else:
             last = {"action_std": np.exp(self._log_std)}
-        return layers | last | {"obs_mean": self._mean, "obs_std": self._std, "obs_clip": np.asarray(self._clip)}
+        observed = {"obs_mean": self._mean, "obs_std": self._std, "obs_clip": np.asarray(self._clip)}
+        return layers | last | observed | {"action_low": self._low, "action_high": self._high}
 
     def mode(self, obs: np.ndarray) -> np.ndarray:
         """The mode of the policy: [obs_dim] -> [action_dim], the action without noise."""
-        return self._act(obs, np.zeros(len(self._center)))
+        return self._act(obs, np.zeros(len(self._low)))
 
     def sample(self, obs: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """An action drawn from the policy: [obs_dim] -> [action_dim]."""
-        return self._act(obs, random.standard_normal(len(self._center)))
+        return self._act(obs, random.standard_normal(len(self._low)))
 
     def _act(self, obs: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        action: np.ndarray = np.clip(self._draw(obs, noise), self._low, self._high)
+        return action
+
+    def _draw(self, obs: np.ndarray, noise: np.ndarray) -> np.ndarray:
         x = np.clip((obs - self._mean) / self._std, -self._clip, self._clip)
         for kernel, bias in self._layers[:-1]:
             x = self._activation(x @ kernel + bias)

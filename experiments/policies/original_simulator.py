@@ -75,12 +75,11 @@ def run_episode(
 ) -> dict[str, np.ndarray]:
     """What gymnasium reports at each of T steps: `velocity [T, 2]` and the four reward terms `[T]`."""
     obs, _ = simulator.reset(seed=seed)
-    low, high = simulator.action_space.low, simulator.action_space.high
     rows = []
     done = False
     while not done:
         action = policy.mode(obs) if deterministic else policy.sample(obs, random)
-        obs, _, terminated, truncated, info = simulator.step(np.clip(action, low, high))
+        obs, _, terminated, truncated, info = simulator.step(action)
         done = terminated or truncated
         velocity = [info["x_velocity"], info.get("y_velocity", 0.0)]
         rows.append(velocity + [info.get(key, 0.0) for key in _TERMS.values()])

@@ -13,12 +13,16 @@ import numpy as np
 from ccil_jax.config import CHOICES, Config
 from ccil_jax.demonstrations import npz
 from ccil_jax.demonstrations.npz import ArchiveError
+from envs.lookup import hint
+from envs.registry import TASKS
+from experiments.cli.command_line import UsageError, launcher_command
 from experiments.policies.numpy_policy import CLIP
 
 MAX_LAYERS = 32
 _AGAIN = "write the file again with `evaluate --export`"
 _GAUSSIAN, _SQUASHED = ("action_std",), ("action_center", "action_half_range")
 _OBSERVED = ("obs_mean", "obs_std", "obs_clip")
+_BOUNDS = ("action_low", "action_high")  # which files of earlier versions lack, the shipped ones among them
 _EPISODES = ("episode_return", "episode_cost")
 _TRAINING = {"task": str, "method": str, "env_options": dict, "physics": str}  # what has to be known of a training
 
@@ -97,23 +101,37 @@ def shipped() -> Path:
     return Path(str(resources.files("experiments"))) / "experts"
 
 
-def find(named: Path) -> Path:
-    """The file itself; or that of a shipped expert, where `named` is the name of its task and no file."""
+def find(named: Path, option: str) -> Path:
+    """The file itself; or that of a shipped expert, where `named` is the name of its task and no file.
+
+    Raises:
+        UsageError: there is no such file, and the name is that of a task whose expert is not shipped, or of none.
+    """
+    if named.exists() or len(named.parts) > 1 or named.suffix:
+        return named
     known = shipped() / f"{named.name}.npz"
-    return known if len(named.parts) == 1 and not named.exists() and known.is_file() else named
+    if known.is_file():
+        return known
+    names = sorted(path.stem for path in shipped().glob("*.npz"))
+    remedy = f"{hint(named.name, names)}correct the path or the name"
+    if named.name in TASKS:
+        train = f"{launcher_command('expert')} --env {named} --out {named}.npz --export {named}_policy.npz"
+        remedy = f"train one with `{train}`"
+    raise UsageError(
+        f"{option} {named}: no such file, and no expert of that name is shipped (shipped: {', '.join(names)}); {remedy}"
+    )
 
 
 def read(path: Path) -> PolicyFile:
     """Reads and checks a file. Imports no JAX. Raises `ArchiveError`, which names file, key and remedy."""
     layers = [f"{kind}_{i}" for i in range(MAX_LAYERS) for kind in ("kernel", "bias")]
-    optional = frozenset({*layers[2:], *_GAUSSIAN, *_SQUASHED, *_EPISODES})
-    arrays = npz.read(
-        path, (*layers, *_GAUSSIAN, *_SQUASHED, *_OBSERVED, *_EPISODES, "metadata"), optional=optional, remedy=_AGAIN
-    )
+    optional = frozenset({*layers[2:], *_GAUSSIAN, *_SQUASHED, *_BOUNDS, *_EPISODES})
+    names = (*layers, *_GAUSSIAN, *_SQUASHED, *_OBSERVED, *_BOUNDS, *_EPISODES, "metadata")
+    arrays = npz.read(path, names, optional=optional, remedy=_AGAIN)
     metadata = npz.json_object(arrays.pop("metadata"), f"{path}: 'metadata'", _AGAIN)
     _check_metadata(path, metadata)
     for name, values in arrays.items():
-        if values.dtype.kind != "f" or not (np.isfinite(values).all() or name == "obs_clip"):
+        if values.dtype.kind != "f" or not (np.isfinite(values).all() or name in ("obs_clip", *_BOUNDS)):
             raise ArchiveError(f"{path}: '{name}' holds something else than finite numbers; {_AGAIN}")
     last = _GAUSSIAN if "action_std" in arrays else _SQUASHED
     depth = sum(name.startswith("kernel_") for name in arrays)
@@ -130,6 +148,9 @@ def read(path: Path) -> PolicyFile:
             _same(shapes[name], shape)
         _same(shapes["obs_mean"], (num, obs_dim))
         _same(shapes["obs_std"], (num, obs_dim))
+        if set(_BOUNDS) & arrays.keys():
+            low, high = (arrays[name] for name in _BOUNDS)
+            _same((low.shape, high.shape, bool((low <= high).all())), (shapes[last[0]], shapes[last[0]], True))
         for name in set(_EPISODES) & arrays.keys():
             _same((len(shapes[name]), shapes[name][:1]), (2, (num,)))
         if last == _GAUSSIAN:

@@ -50,7 +50,7 @@ def of_run(folder: Path) -> Source:
 
 def of_file(named: Path) -> Source:
     """The policies of a file, or of a shipped expert by the name of its task. Raises `UserError` if it is unsound."""
-    file = policy_file.read(policy_file.find(named))
+    file = policy_file.read(policy_file.find(named, "--policy"))
     training = file.training
     if training["task"] not in registry.TASKS:  # a module that a file names is not imported: it would run its code
         raise UsageError(

@@ -4,7 +4,9 @@ import argparse
 from pathlib import Path
 
 from ccil_jax.demonstrations import formats, minari_datasets
+from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.errors import DemonstrationsError
+from envs.registry import TASKS
 from experiments.cli import command_line
 from experiments.cli.command_line import UsageError
 
@@ -36,6 +38,22 @@ def check_new(path: Path, option: str, *, overwrite: bool) -> None:
         command_line.check_new_file(path, option, overwrite=overwrite)
     elif minari_datasets.folder_of(path).exists() and not overwrite:
         raise UsageError(f"{option} {path}: there is such a dataset; choose another name or add --overwrite")
+
+
+def note_on_rewards(demonstrations: Demonstrations | None, task: str) -> str | None:
+    """A line about demonstrations of gymnasium's environment, where its reward is not that of our `task`; else None.
+
+    A dataset of Minari names its environment; files of other formats do not say where their rewards come from.
+    """
+    if demonstrations is None or demonstrations.rewards is None or task not in TASKS:
+        return None
+    original, lacks = TASKS[task].original, TASKS[task].reward_lacks
+    if not lacks or demonstrations.metadata.get("environment") != original:
+        return None
+    return (
+        f"the demonstrations are of {original}, whose reward contains {lacks}. That of our {task} does not, so their "
+        "return, and with it the recovered %, does not compare with the learner's"
+    )
 
 
 def check_writable(path: Path, option: str) -> None:

@@ -45,8 +45,13 @@ def _check_functions(task: str, env: Any) -> None:
     from ccil_jax.trees import difference
 
     action = jax.ShapeDtypeStruct((env.action_dim,), jnp.result_type(float))
-    first = user_code.call(f"--env {task}: reset", jax.eval_shape, env.reset, jax.random.key(0))
-    after = user_code.call(f"--env {task}: step", jax.eval_shape, env.step, first, action)
+    try:
+        first = user_code.call(f"--env {task}: reset", jax.eval_shape, env.reset, jax.random.key(0))
+        after = user_code.call(f"--env {task}: step", jax.eval_shape, env.step, first, action)
+    except UserError:
+        raise
+    except ValueError as error:  # of `envs`, about what a function of the user's, such as a cost, has returned
+        raise UsageError(f"--env {task}: {error}") from error
     wanted = {"obs": (env.obs_dim,), "reward": (), "cost": (), "terminated": (), "truncated": ()}
     for where, state in (("reset", first), ("step", after)):
         if not isinstance(state, envs.State):

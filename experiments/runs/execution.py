@@ -10,8 +10,9 @@ import numpy as np
 from ccil_jax.training import filesystem
 from ccil_jax.training.progress import Display
 from experiments.cli import xla
+from experiments.cli.command_line import RUN_LOCK
 from experiments.cli.interruption import Interruption
-from experiments.runs import fault_files, run_folder, summary
+from experiments.runs import demonstration_files, fault_files, run_folder, summary
 from experiments.runs.environments import build_environment
 from experiments.runs.metrics_file import read_metrics
 from experiments.runs.plans import ProgramPlan, RunPlan, Setup
@@ -60,7 +61,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
     """
     setup, config = program.setup, program.config
     with (
-        filesystem.hold(program.checkpoint_dir / ".run.lock"),
+        filesystem.hold(program.checkpoint_dir / RUN_LOCK),
         Display(
             f"{config.method} {setup.task}",
             config.num_iterations,
@@ -69,6 +70,8 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         ) as display,
         Interruption() as interruption,
     ):
+        if note := demonstration_files.note_on_rewards(setup.demonstrations, setup.task):
+            display.message(f"note: {note}")
         display.message(f"{_announcement(program)}; compiling ...")
         xla.spread_seeds(program.num_runs)
         # This imports JAX, so that it has to wait until the input has been checked.
@@ -93,7 +96,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
                     f"seed {capped}: the multiplier ended at its largest value, {plan.config.multiplier_max:g}, and "
                     "the cost above its limit: the cost does not follow it"
                 )
-        display.message(f"evaluating {setup.eval_episodes} episodes per seed ...")
+        display.message(f"evaluating {setup.eval_episodes} episodes per seed, and of the random policy ...")
         evaluations, random = _evaluate(setup, [result for _, result in trained], env)
         return [
             Outcome(

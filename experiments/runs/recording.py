@@ -1,5 +1,6 @@
 """Demonstrations by the policy of a finished run: which seed is recorded, and what the file says about it."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -139,6 +140,7 @@ def record(
 
     from ccil_jax.acting import evaluation
 
+    print(f"recording {num_trajectories} episodes ...", file=sys.stderr, flush=True)
     return evaluation.record(
         config,
         jax.tree.map(lambda leaf: leaf[seed_index], agents),
