@@ -155,13 +155,13 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "evaluate two": (("evaluate", "done", "--policy", "good.npz"), "RUN_DIR: give the folder of a run, or --policy"),
     "evaluate no policy": (("evaluate", "--policy", "none.npz"), "none.npz: no such file; check the path"),
     "evaluate an expert that is not shipped": (
-        ("evaluate", "--policy", "Ant"),
-        "--policy Ant: no such file, and no expert of that name is shipped (shipped: CarGoal1, HalfCheetah, Hopper,",
+        ("evaluate", "--policy", "Humanoid"),
+        "--policy Humanoid: no such file, and no expert of that name is shipped (shipped: Ant, CarGoal1,",
     ),
     "evaluate an unknown expert": (("evaluate", "--policy", "Hoper"), "did you mean Hopper? correct the path or the"),
     "show an expert that is not shipped": (
-        ("report", "--policies", "Ant", "--out", "new.html"),
-        "train one with `python -m experiments.expert --env Ant --out Ant.npz --export Ant_policy.npz`",
+        ("report", "--policies", "Humanoid", "--out", "new.html"),
+        "train one with `python -m experiments.expert --env Humanoid --out Humanoid.npz --export Humanoid_policy.npz`",
     ),
     "a rule of the multiplier of one's own": (
         ("train", "--method", "ccil", "--env", "Swimmer", "--multiplier-update", "my_methods:rule"),

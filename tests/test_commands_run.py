@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,18 +29,29 @@ TINY = ["--preset", "tiny", "--num-seeds", "1", "--eval-episodes", "2"]
 # What makes a command long, and is left out before the small settings are added.
 LONG = {
     "train": "preset env-steps num-envs batch-size discriminator-minibatch-size critic-minibatch-size cloning-updates "
-    "num-seeds eval-episodes config",
+    "num-seeds eval-episodes",
     "expert": "preset num-envs batch-size num-seeds eval-episodes num-trajectories cost-limit env-steps",
     "evaluate": "episodes num-trajectories",
     "ablations": "preset env-steps num-seeds eval-episodes questions batch-size",
-    "benchmark": "preset tasks num-seeds num-envs jobs",
+    "benchmark": "preset tasks num-seeds num-envs jobs quick overwrite",
     "growth": "axes largest",
 }
 SHORT = {
     "train": TINY,
     "evaluate": ["--episodes", "2"],
     "ablations": [*TINY, "--questions", "outer_loss"],
-    "benchmark": ["--preset", "tiny", "--tasks", "Swimmer", "--num-seeds", "1", "--num-envs", "4", "--quick"],
+    "benchmark": [
+        "--preset",
+        "tiny",
+        "--tasks",
+        "Swimmer",
+        "--num-seeds",
+        "1",
+        "--num-envs",
+        "4",
+        "--quick",
+        "--overwrite",
+    ],
     "growth": ["--axes", "seeds", "--largest", "2"],
 }
 TINY_STEPS, LIMIT = 240, "100000"  # an expert that is hardly trained keeps a limit that none can exceed
@@ -58,8 +70,14 @@ NOT_CARRIED_OUT = {  # how a command begins that is not carried out here, and wh
     "export ": "of the shell",
     "experiments.convert cart.csv": "needs a format of one's own; `test_extending.py` has it",
 }
+RUNS = {  # finished runs that a page presupposes
+    "docs/commands.md": "runs/demo runs/other runs/first",
+    "docs/results.md": "RUN runs/TASK_malm runs/TASK_cvag runs/TASK_ccil runs/TASK_gail",
+}
 CLUSTER = re.compile(r"--launcher (ray|slurm)")  # `test_sweep.py` has a launcher of its own in their place
-SENTENCES = re.compile(r"^(train|ccil) ")  # in the middle of a sentence, without what the launcher needs
+SENTENCES = re.compile(
+    r"^((train|ccil) |experiments.train$)"
+)  # in the middle of a sentence, without what the launcher needs
 
 
 def without(words: Sequence[str], options: str) -> list[str]:
@@ -95,7 +113,9 @@ def shortened(launcher: str, given: Sequence[str]) -> list[str]:
     if launcher == "train" and "--resume" in words:
         return words
     if launcher == "evaluate":
-        return [*words, *SHORT[launcher], "--overwrite", *(["--num-trajectories", "2"] if "--record" in words else [])]
+        written = {"--record", "--export", "--video"} & {*words}
+        recorded = ["--num-trajectories", "2"] if "--record" in words else []
+        return [*words, *SHORT[launcher], *recorded, *(["--overwrite"] if written else [])]
     more = ["--overwrite"] if launcher in ("convert", "report") and "--overwrite" not in words else []
     return [*words, *SHORT.get(launcher, []), *more]
 
@@ -120,7 +140,9 @@ def carry_out(words: Sequence[str]) -> None:
         name = first.removeprefix("experiments.")
         given = [str(path) for word in given for path in (sorted(Path().glob(word)) if "*" in word else [word])]
         try:
-            status = importlib.import_module(first).main(shortened(name, given))
+            with warnings.catch_warnings():
+                warnings.simplefilter("default")  # as for a reader: Brax warns of itself
+                status = importlib.import_module(first).main(shortened(name, given))
         except SystemExit as end:  # `--help`, and bad input, which has said what is wrong
             status = end.code
         assert status in (0, None), shlex.join(shortened(name, given))
@@ -134,7 +156,8 @@ def first_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run, as the pages presuppose one."""
     folder = tmp_path_factory.mktemp("first") / "run"
     with quick_compilation():
-        assert train.main(["--method", "malm", "--env", "HalfCheetah", *TINY, "--out", str(folder)]) == 0
+        two = ["--num-seeds", "2", "--out", str(folder)]
+        assert train.main(["--method", "malm", "--env", "HalfCheetah", *TINY, *two]) == 0
     return folder
 
 
@@ -146,22 +169,46 @@ def make_dataset() -> None:
         env.reset(seed=seed)
         while not any(env.step(env.action_space.sample())[2:4]):
             pass
-    env.create_dataset("mujoco/hopper/expert-v0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no author, no description
+        env.create_dataset("mujoco/hopper/expert-v0")
+    env.close()
+
+
+def write_modules(folder: Path) -> None:
+    """What the page on extensions tells to put into `my_tasks.py` and `my_methods.py`, beside what is there."""
+    texts = [*blocks("docs/extending.md", "python")]
+    (brax,) = (text.partition("brax_env =")[0] for text in texts if "def pendulum_of_brax" in text)
+    with (folder / "my_tasks.py").open("a", encoding="utf-8") as file:
+        file.write(brax)
+    (rule,) = (text.partition("agent =")[0] for text in texts if "def leaky" in text)
+    (row,) = (text for text in texts if text.startswith("LEAKY ="))
+    text = f"import jax.numpy as jnp\nimport ccil_jax\n{rule}{row}"
+    (folder / "my_methods.py").write_text(text, encoding="utf-8")
 
 
 @pytest.fixture
-def reader(tmp_path: Path, first_run: Path, monkeypatch: pytest.MonkeyPatch, own_tasks: Path) -> Path:  # noqa: F811
-    """A folder with what a reader has at the start of a page."""
+def reader(
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    first_run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    own_tasks: Path,  # noqa: F811
+) -> Path:
+    """A folder with what a reader has at the start of the page that the test's parameter names."""
+    page = request.node.callspec.params["page"]
     del own_tasks  # the same folder, with `my_tasks.py`, where we are now
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")  # of processes that a launcher starts
-    for name in ("demo", "other", "first"):
-        shutil.copytree(first_run, tmp_path / "runs" / name)
-    shutil.copytree(first_run, tmp_path / "RUN")
-    for task in ("TASK_malm", "TASK_cvag", "TASK_ccil", "TASK_gail"):
-        shutil.copytree(first_run, tmp_path / "runs" / task)
+    for name in RUNS.get(page, "").split():
+        shutil.copytree(first_run, tmp_path / name)
     shutil.copy(ROOT / "experiments/demonstrations/Swimmer.npz", tmp_path / "FILE")
-    shutil.copy(ROOT / "experiments/demonstrations/Walker2d.npz", tmp_path / "runs" / "Walker2d.npz")
+    if page == "docs/ablations_paper.md":
+        shutil.copytree(ROOT / "experiments/demonstrations", tmp_path / "runs")
+    if page == "docs/demonstrations.md":
+        make_dataset()
+    if page == "docs/extending.md":
+        write_modules(tmp_path)
     (spec,) = blocks("docs/sweeps.md", "toml")
     short = spec.replace("num_seeds = 3\nenv_steps = 300000", 'num_seeds = 1\npreset = "tiny"\neval_episodes = 2')
     assert short != spec
@@ -174,8 +221,6 @@ def reader(tmp_path: Path, first_run: Path, monkeypatch: pytest.MonkeyPatch, own
 def test_the_commands_of_a_page_do_what_they_should(
     page: str, reader: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if page == "docs/demonstrations.md":
-        make_dataset()
     failed = {}
     for command in carried_out(page):
         try:
