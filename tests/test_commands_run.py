@@ -4,6 +4,7 @@ Together they take many minutes, so these tests are slow ones; `test_commands.py
 tests.
 """
 
+import gc
 import importlib
 import json
 import os
@@ -170,9 +171,11 @@ def make_dataset() -> None:
         while not any(env.step(env.action_space.sample())[2:4]):
             pass
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # no author, no description
+        warnings.simplefilter("ignore")  # no author, no description, and a folder that nobody removes
         env.create_dataset("mujoco/hopper/expert-v0")
-    env.close()
+        env.close()
+        del env
+        gc.collect()
 
 
 def write_modules(folder: Path) -> None:
