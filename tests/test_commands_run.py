@@ -210,6 +210,8 @@ def reader(
         shutil.copytree(ROOT / "experiments/demonstrations", tmp_path / "runs")
     if page == "docs/demonstrations.md":
         make_dataset()
+        (recording,) = blocks(page, "python")
+        subprocess.run([sys.executable, "-c", recording], check=True)
     if page == "docs/extending.md":
         write_modules(tmp_path)
     (spec,) = blocks("docs/sweeps.md", "toml")
