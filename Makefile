@@ -20,9 +20,8 @@ JOBS ?= $(or $(shell nproc 2>/dev/null),auto)
 SUITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(shell for p in python3.12 python3.11 python3; do "$$p" -c "$(SUITS)" 2>/dev/null && echo "$$p" && break; done)
 
-# The tests of a file share what they have compiled, so they run in one process. Files come in the order of their names:
-# pytest-xdist would start those with the fewest tests last, and they are among the longest, so that one process would
-# work alone in the end.
+# The tests of a file share what they have compiled, so they run in one process. Files come in the order that
+# tests/conftest.py gives them: pytest-xdist would start those with the fewest tests last, and they are among the longest.
 SHARED := --dist loadfile --no-loadscope-reorder
 BIN := $(VENV)/bin
 RUN := $(BIN)/python -m

@@ -85,6 +85,15 @@ assert not set(CHECKED) & set(sys.modules), "imported too early to be checked"
 sys.meta_path.insert(0, CheckingFinder())
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files come in the reverse order of their names.
+
+    The tests of a file run in one process, and short files come first by name: with these at the end, no process works
+    alone for long.
+    """
+    items.sort(key=lambda item: item.path.name, reverse=True)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Tests run where nothing of the checkout is near and stray files, such as MuJoCo's log, do no harm."""

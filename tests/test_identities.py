@@ -29,6 +29,8 @@ from tests.probe_envs import (
     walk_demonstrations,
 )
 
+pytestmark = pytest.mark.once
+
 Run = tuple[AgentState, Metrics]
 NUM_ITERATIONS = 4  # of two generator steps: the second iteration's rewards, multipliers and statistics have moved
 
