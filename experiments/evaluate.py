@@ -234,7 +234,7 @@ def check_video(arguments: argparse.Namespace) -> None:
 
 
 def check_drawing(file: Path, task: str, env: Any) -> None:
-    """Raises `UsageError` where `env`, an environment of `task`, cannot be drawn, or a program for the video lacks."""
+    """Raises `UsageError` where `env`, an environment of `task`, cannot be drawn, or the encoder is missing."""
     from experiments.page import film  # imports MuJoCo
 
     if reason := film.obstacle(env):

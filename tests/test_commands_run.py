@@ -7,7 +7,6 @@ tests.
 import gc
 import importlib
 import json
-import os
 import re
 import shlex
 import shutil
@@ -23,10 +22,9 @@ import pytest
 
 from experiments import train
 from tests.probe_envs import quick_compilation
-from tests.test_commands import PLACEHOLDERS, Command, blocks, commands, own_tasks  # noqa: F401  (a fixture)
+from tests.test_commands import PLACEHOLDERS, TINY, Command, blocks, commands, own_tasks  # noqa: F401  (a fixture)
 from tests.test_documentation import PAGES, ROOT
 
-TINY = ["--preset", "tiny", "--num-seeds", "1", "--eval-episodes", "2"]
 # What makes a command long, and is left out before the small settings are added.
 LONG = {
     "train": "preset env-steps num-envs batch-size discriminator-minibatch-size critic-minibatch-size cloning-updates "
@@ -41,18 +39,7 @@ SHORT = {
     "train": TINY,
     "evaluate": ["--episodes", "2"],
     "ablations": [*TINY, "--questions", "outer_loss"],
-    "benchmark": [
-        "--preset",
-        "tiny",
-        "--tasks",
-        "Swimmer",
-        "--num-seeds",
-        "1",
-        "--num-envs",
-        "4",
-        "--quick",
-        "--overwrite",
-    ],
+    "benchmark": "--preset tiny --tasks Swimmer --num-seeds 1 --num-envs 4 --quick --overwrite".split(),
     "growth": ["--axes", "seeds", "--largest", "2"],
 }
 TINY_STEPS, LIMIT = 240, "100000"  # an expert that is hardly trained keeps a limit that none can exceed
@@ -76,9 +63,8 @@ RUNS = {  # finished runs that a page presupposes
     "docs/results.md": "RUN runs/TASK_malm runs/TASK_cvag runs/TASK_ccil runs/TASK_gail",
 }
 CLUSTER = re.compile(r"--launcher (ray|slurm)")  # `test_sweep.py` has a launcher of its own in their place
-SENTENCES = re.compile(
-    r"^((train|ccil) |experiments.train$)"
-)  # in the middle of a sentence, without what the launcher needs
+# In the middle of a sentence, without what the launcher needs.
+SENTENCES = re.compile(r"^((train|ccil) |experiments\.train$)")
 
 
 def without(words: Sequence[str], options: str) -> list[str]:
@@ -104,13 +90,8 @@ def shortened(launcher: str, given: Sequence[str]) -> list[str]:
         steps = TINY_STEPS * int(value_of(given, "--env-steps", 3e6) / 1e5) // 10
         limit = [] if "--unconstrained" in words else ["--cost-limit", LIMIT]
         size = ["--env-steps", str(steps)] if "--env-steps" in given or "--resume" not in words else []
-        return [
-            *words,
-            *limit,
-            *size,
-            "--overwrite",
-            *([] if "--resume" in words else [*TINY, "--num-trajectories", "2"]),
-        ]
+        new = [] if "--resume" in words else [*TINY, "--num-trajectories", "2"]
+        return [*words, *limit, *size, *new, "--overwrite"]
     if launcher == "train" and "--resume" in words:
         return words
     if launcher == "evaluate":
@@ -197,7 +178,7 @@ def reader(
     first_run: Path,
     monkeypatch: pytest.MonkeyPatch,
     own_tasks: Path,  # noqa: F811
-) -> Path:
+) -> None:
     """A folder with what a reader has at the start of the page that the test's parameter names."""
     page = request.node.callspec.params["page"]
     del own_tasks  # the same folder, with `my_tasks.py`, where we are now
@@ -218,14 +199,12 @@ def reader(
     short = spec.replace("num_seeds = 3\nenv_steps = 300000", 'num_seeds = 1\npreset = "tiny"\neval_episodes = 2')
     assert short != spec
     (tmp_path / "spec.toml").write_text(short, encoding="utf-8")
-    return tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("reader")
 @pytest.mark.parametrize("page", [page for page in PAGES if carried_out(page)])
-def test_the_commands_of_a_page_do_what_they_should(
-    page: str, reader: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_commands_of_a_page_do_what_they_should(page: str, capsys: pytest.CaptureFixture[str]) -> None:
     failed = {}
     for command in carried_out(page):
         try:
@@ -233,7 +212,6 @@ def test_the_commands_of_a_page_do_what_they_should(
         except (AssertionError, subprocess.CalledProcessError) as error:
             failed[shlex.join(command.words)] = f"{error} {capsys.readouterr().err[-2000:]}"
     assert not failed, json.dumps(failed, indent=1)
-    assert os.listdir(reader)
 
 
 def test_what_is_not_carried_out_is_a_command_of_a_page() -> None:
