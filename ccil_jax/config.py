@@ -265,7 +265,13 @@ class Config:
         10, "an iteration that yields NaN or infinity is taken back; a seed stops after this many of them in a row", ALL
     )
 
-    gamma: float = _traced(0.995, "discount factor of reward and cost, per step (Table 1)", ACTING)
+    gamma: float = _traced(0.995, "discount factor of the reward, per step; the cost has the same (Table 1)", ACTING)
+    cost_gamma: float | None = _traced(
+        None,
+        "discount factor of the cost, per step; none takes gamma. A small one charges a step with the cost that "
+        "follows soon, but not with that of staying alive",
+        CONSTRAINED,
+    )
     gae_lambda: float = _traced(0.97, "lambda of generalised advantage estimation, for the reward (Table 1)")
     cost_gae_lambda: float = _traced(
         0.97, "lambda of generalised advantage estimation, for the cost (Table 1)", CONSTRAINED
@@ -555,9 +561,9 @@ def _check_ranges(config: Config) -> None:
         value = getattr(config, name)
         if value is not None and not (math.isfinite(value) and value >= 0):
             raise ConfigError(f"--{name} {value}: must be finite and not negative")
-    for name in ("gamma", "gae_lambda", "cost_gae_lambda", "critic_lambda"):
-        if getattr(config, name) > 1:
-            raise ConfigError(f"--{name} {getattr(config, name)}: must be at most 1")
+    for name in ("gamma", "cost_gamma", "gae_lambda", "cost_gae_lambda", "critic_lambda"):
+        if (value := getattr(config, name)) is not None and value > 1:
+            raise ConfigError(f"--{name} {value}: must be at most 1")
     if config.max_kl == 0:
         raise ConfigError("--max_kl 0: the policy could never move; give a positive radius such as 0.01")
     if not 0 <= config.held_out_fraction < 1:

@@ -50,6 +50,7 @@ class Fields(TypedDict, total=False):
     value_loss: str
     max_skipped_updates: int
     gamma: float
+    cost_gamma: float | None
     gae_lambda: float
     cost_gae_lambda: float
     critic_lambda: float

@@ -45,7 +45,7 @@ VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHOD
     "gail with the coherent reward": {"method": "gail", "cloning_updates": 200, "imitation_reward": "coherent"},
 }
 # Multiplied by the weight 0 of a cost that does not enter: a dependence by the text of the program alone.
-TIMES_ZERO = {"cost_gae_lambda"}
+TIMES_ZERO = {"cost_gae_lambda", "cost_gamma"}
 NO_COST = [name for name in VARIANTS if name.startswith(("gail", "trpo"))]
 NOTHING = dict.fromkeys(NO_COST, TIMES_ZERO)
 OTHER: dict[str, Any] = {  # another value of each static field that narrows what a method is

@@ -138,6 +138,24 @@ def test_without_a_choice_the_advantages_lambda_is_that_of_the_target() -> None:
         validate(Config(critic_target="td_lambda", critic_lambda=1.5))
 
 
+def test_the_cost_has_a_discount_of_its_own() -> None:
+    """The cost's is that of a method with this discount for both signals; the reward's stays what it is."""
+    own, usual, both = assessed(cost_gamma=0.5), assessed(), assessed(gamma=0.5)
+    np.testing.assert_array_equal(assessed(cost_gamma=0.95).cost_advantage, usual.cost_advantage)
+    np.testing.assert_allclose(own.cost_advantage, both.cost_advantage, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(own.returns[:, on_policy.COST], both.returns[:, on_policy.COST], rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(own.reward_advantage, usual.reward_advantage)
+    np.testing.assert_array_equal(own.returns[:, on_policy.REWARD], usual.returns[:, on_policy.REWARD])
+    assert np.abs(own.cost_advantage - usual.cost_advantage).max() > 1e-3
+
+
+def test_the_costs_discount_is_refused_beyond_1_and_without_a_cost() -> None:
+    with pytest.raises(ConfigError, match=r"cost_gamma 1\.5: must be at most 1"):
+        validate(Config(cost_gamma=1.5))
+    with pytest.raises(ConfigError, match=r"cost_gamma 0\.5: makes no difference to this run of method gail"):
+        validate(Config(method="gail", cost_gamma=0.5))
+
+
 def test_explained_variance_by_hand() -> None:
     """Of a perfect critic, of one that is off by a constant, of one that knows nothing, of one that is worse."""
     target = np.array([[1.0, 2.0], [3.0, 6.0]], np.float32)

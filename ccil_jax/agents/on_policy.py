@@ -363,11 +363,13 @@ def assess(parts: Parts, state: AgentState, transition: Transition) -> tuple[Bat
         lambda obs: values(normalize(obs)), value, transition.next_obs, no_future, transition.done
     )
     lambdas = jnp.stack([jnp.asarray(config.gae_lambda), jnp.asarray(config.cost_gae_lambda)])
-    both = jax.vmap(gae, in_axes=(0, 0, 0, None, None, None, 0))
-    advantage, returns = both(signals, value, next_value, no_future, transition.done, config.gamma, lambdas)
+    cost_gamma = config.gamma if config.cost_gamma is None else config.cost_gamma
+    gammas = jnp.stack([jnp.asarray(config.gamma), jnp.asarray(cost_gamma)])
+    both = jax.vmap(gae, in_axes=(0, 0, 0, None, None, 0, 0))
+    advantage, returns = both(signals, value, next_value, no_future, transition.done, gammas, lambdas)
     if config.critic_target == "td_lambda":
         lambdas = jnp.broadcast_to(jnp.asarray(config.critic_lambda), (2,))
-        _, returns = both(signals, value, next_value, no_future, transition.done, config.gamma, lambdas)
+        _, returns = both(signals, value, next_value, no_future, transition.done, gammas, lambdas)
 
     reward_advantage, cost_advantage = advantage[REWARD], advantage[COST]
     reward_advantage = (reward_advantage - jnp.mean(reward_advantage)) / (jnp.std(reward_advantage) + 1e-8)
