@@ -16,7 +16,7 @@ import pytest
 from ccil_jax.errors import UserError
 from ccil_jax.methods import METHODS, find_method
 from envs.registry import TASKS
-from experiments import ablations, expert, sweep, train
+from experiments import ablations, sweep
 from experiments.cli import console, options
 from experiments.cli.names import safe_name
 from experiments.page import film
@@ -229,21 +229,6 @@ def own_tasks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
         stack.callback(sys.modules.pop, "my_tasks", None)
         stack.enter_context(quick_compilation())
         yield tmp_path
-
-
-@pytest.mark.slow  # `test_user_tasks.py` does the same with another task, in more ways
-@pytest.mark.parametrize(("task", "limit", "made"), [("Cart", "20", "cart"), ("slow_cheetah", "1000", "slow_cheetah")])
-def test_a_task_in_a_file_is_trained_by_the_commands_of_the_page(
-    task: str, limit: str, made: str, own_tasks: Path
-) -> None:
-    launchers = {"experiments.expert": expert, "experiments.train": train}
-    of_page = [c.words for c in commands() if c.page == "docs/extending.md" and f"my_tasks:{task}" in c.words]
-    carried_out = [words[2:] for words in of_page if words[:2] == ("python", "-m") and words[2] in launchers]
-    assert len(carried_out) == 2
-    for module, *given in carried_out:
-        more = ["--cost-limit", limit] if module.endswith("expert") else []  # what is hardly trained costs more
-        assert launchers[module].main([*given, *more, *TINY]) == 0
-    assert (own_tasks / f"{made}.npz").is_file()
 
 
 def test_a_task_under_another_cost_is_built_as_the_launchers_do_it(own_tasks: Path) -> None:

@@ -19,6 +19,7 @@ from experiments.runs.metrics_file import MetricsWriter, read_metrics
 from experiments.runs.run_log import _writers_of
 from experiments.runs.wandb_log import WandbWriter
 from experiments.sweeps import variants
+from tests.probe_envs import quick_compilation
 
 METRICS = {
     "env_steps": np.array([[40, 40], [80, 80]]),
@@ -111,3 +112,21 @@ def test_a_run_has_a_project_only_if_it_is_given_one(tmp_path: Path) -> None:
     assert plans[0].setup == plans[1].setup  # they may share a program
     fields = {"method": "bc", "env": "Swimmer", "wandb": "p"}
     assert variants.make_variant("x", fields, tmp_path / "sweep").plan.wandb == "p"
+
+
+def test_the_scores_of_the_evaluation_come_last(tmp_path: Path) -> None:
+    """Those of summary.json, of each seed and their means; what is unknown, as the return of no expert, is left out."""
+    options = ["--method", "trpo", "--env", "Swimmer", "--preset", "tiny", "--num-seeds", "2", "--eval-episodes", "2"]
+    folder = tmp_path / "run"
+    with quick_compilation():
+        assert train.main([*options, "--out", str(folder), "--wandb", "my-project"]) == 0
+    content = json.loads((folder / "summary.json").read_text())
+    updates = [item for record in records(folder) for item in record.summary.update]
+    logged = {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in updates}
+    scores = {name: value for name, value in logged.items() if name.startswith("evaluation/")}
+    for seed, row in enumerate(content["per_seed"]):
+        known = {name: value for name, value in row.items() if value is not None}
+        assert {name: scores.pop(f"evaluation/seed_{seed}/{name}") for name in known} == known
+    means = {name: score["mean"] for name, score in content["aggregate"].items() if score}
+    assert {"episode_return", "episode_cost"} <= means.keys()
+    assert scores == {f"evaluation/mean/{name}": mean for name, mean in means.items()}

@@ -69,6 +69,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
             has_multiplier=config.has_multiplier,
         ) as display,
         Interruption() as interruption,
+        contextlib.ExitStack() as stack,
     ):
         if note := demonstration_files.note_on_rewards(setup.demonstrations, setup.task):
             display.message(f"note: {note}")
@@ -76,6 +77,7 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         xla.spread_seeds(program.num_runs)
         # This imports JAX, so that it has to wait until the input has been checked.
         from ccil_jax.agents.build import resolve
+        from ccil_jax.training import combining
 
         env = build_environment(setup.task, setup.physics, setup.env_options)
         for run in program.runs:  # what does not fit is refused before anything is written
@@ -86,7 +88,11 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
         for plan in todo.values():
             if not plan.resume:  # of a resumed run it is written once it is certain that the run goes on
                 write_config(plan, env)
-        results, rate = _train(program, todo, env, display, interruption)
+        columns = combining.columns(len(program.runs), setup.num_seeds)
+        log = RunLog(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
+        for place in log.places:
+            display.message(f"Weights & Biases: {place}")
+        results = _train(program, todo, log, env, display, interruption)
         trained = [(plan, results[i]) for i, plan in todo.items()]
         for plan, result in trained:
             for seed in np.flatnonzero(result.stopped):
@@ -98,7 +104,8 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
                 )
         display.message(f"evaluating {setup.eval_episodes} episodes per seed, and of the random policy ...")
         evaluations, random = _evaluate(setup, [result for _, result in trained], env)
-        return [
+        rate = log.env_steps_per_second
+        outcomes = [
             Outcome(
                 plan=plan,
                 result=result,
@@ -109,6 +116,8 @@ def execute_together(program: ProgramPlan) -> list[Outcome]:
             )
             for (plan, result), evaluated in zip(trained, evaluations, strict=True)
         ]
+        log.finish({outcome.plan.folder: outcome.summary for outcome in outcomes})
+        return outcomes
 
 
 def _at_largest_multiplier(result: "Result") -> list[int]:
@@ -137,50 +146,50 @@ def _with_earlier_commands(plan: RunPlan) -> RunPlan:
 
 
 def _train(
-    program: ProgramPlan, todo: Mapping[int, RunPlan], env: Any, display: Display, interruption: Interruption
-) -> tuple[list["Result"], float | None]:
+    program: ProgramPlan,
+    todo: Mapping[int, RunPlan],
+    log: RunLog,
+    env: Any,
+    display: Display,
+    interruption: Interruption,
+) -> list["Result"]:
     """Trains all runs of a program. Only those in `todo`, by their places among all, are written to their folders.
 
     Returns:
-        The results of all runs, and the environment steps per second of all runs together.
+        The results of all runs.
     """
-    from ccil_jax.training import combining, runner
+    from ccil_jax.training import runner
 
     setup, config = program.setup, program.config
-    columns = combining.columns(len(program.runs), setup.num_seeds)
-    with contextlib.ExitStack() as stack:
-        log = RunLog(config, [(plan, columns[i]) for i, plan in todo.items()], env, stack)
-        for place in log.places:
-            display.message(f"Weights & Biases: {place}")
 
-        def on_start(history: "History") -> None:
-            log.begin(history)
-            interruption.defer()
+    def on_start(history: "History") -> None:
+        log.begin(history)
+        interruption.defer()
 
-        def on_progress(progress: "Progress") -> None:
-            log.write(progress)
-            display.update(progress)
+    def on_progress(progress: "Progress") -> None:
+        log.write(progress)
+        display.update(progress)
 
-        results = runner.train_runs(
-            [plan.config for plan in program.runs],
-            env,
-            setup.demonstrations,
-            num_seeds=setup.num_seeds,
-            seed=setup.seed,
-            one_by_one=setup.one_by_one,
-            checkpoint_dir=program.checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
-            resume=program.resume,
-            moved=setup.moved,
-            on_start=on_start,
-            on_progress=on_progress,
-            should_stop=interruption.requested,
-        )
+    results = runner.train_runs(
+        [plan.config for plan in program.runs],
+        env,
+        setup.demonstrations,
+        num_seeds=setup.num_seeds,
+        seed=setup.seed,
+        one_by_one=setup.one_by_one,
+        checkpoint_dir=program.checkpoint_dir.resolve(),  # orbax fails in the background on a relative path
+        resume=program.resume,
+        moved=setup.moved,
+        on_start=on_start,
+        on_progress=on_progress,
+        should_stop=interruption.requested,
+    )
     done = len(results[0].metrics["env_steps"])
     interruption.settle(f"stopped and saved after iteration {done} of {config.num_iterations}; continue with --resume")
     for i, plan in todo.items():
         if (directory := plan.folder / "checkpoints") != program.checkpoint_dir:
             runner.save(results[i], directory)
-    return results, log.env_steps_per_second
+    return results
 
 
 def _evaluate(setup: Setup, results: Sequence["Result"], env: Any) -> tuple[list["Evaluation"], "Evaluation"]:

@@ -2,7 +2,8 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ccil_jax.config import Config
@@ -54,10 +55,19 @@ class RunLog:
         for writer, columns in self._writers:
             writer.write(progress.iteration, {name: rows[:, columns] for name, rows in progress.metrics.items()})
 
+    def finish(self, summaries: Mapping[Path, Mapping[str, Any]]) -> None:
+        """After the evaluation; `summaries` has the content of summary.json of each run folder."""
+        for writer in self._elsewhere:
+            writer.finish(summaries[writer.folder])
+
     @property
     def places(self) -> list[str]:
         """Where else than in the run folders the metrics can be seen."""
-        return [writer.place for writer, _ in self._writers if isinstance(writer, WandbWriter)]
+        return [writer.place for writer in self._elsewhere]
+
+    @property
+    def _elsewhere(self) -> list[WandbWriter]:
+        return [writer for writer, _ in self._writers if isinstance(writer, WandbWriter)]
 
     @property
     def env_steps_per_second(self) -> float | None:

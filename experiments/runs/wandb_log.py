@@ -54,6 +54,7 @@ class WandbWriter:
     def __init__(self, project: str, folder: Path, config: Mapping[str, Any]) -> None:
         import wandb
 
+        self.folder = folder
         settings = wandb.Settings(silent=True, console="off", reinit="create_new")  # several runs may share a process
         try:
             self._run = wandb.init(
@@ -82,6 +83,13 @@ class WandbWriter:
         for number, row in enumerate(rows, iteration - len(rows) + 1):
             steps, values = tagged(number, names, row)
             self._run.log({**values, "env_steps": steps, "iteration": number})
+
+    def finish(self, summary: Mapping[str, Any]) -> None:
+        """Logs the scores of the evaluation, of each seed and their mean; `summary` is the content of summary.json."""
+        of_seeds = {f"seed_{row['seed']}/{name}": row[name] for row in summary["per_seed"] for name in row}
+        means = {f"mean/{name}": score and score["mean"] for name, score in summary["aggregate"].items()}
+        scores = {**of_seeds, **means}
+        self._run.summary.update({f"evaluation/{name}": score for name, score in scores.items() if score is not None})
 
     def __enter__(self) -> Self:
         return self
