@@ -88,6 +88,13 @@ def test_every_task_has_a_picture_on_the_page() -> None:
     assert sum(path.stat().st_size for path in (ROOT / "docs" / "figures" / "tasks").iterdir()) < 400_000
 
 
+def test_every_shipped_expert_has_a_picture_on_the_page() -> None:
+    text = (ROOT / "docs" / "experts.md").read_text(encoding="utf-8")
+    shipped = [path.stem for path in (ROOT / "experiments" / "experts").glob("*.npz")]
+    assert sorted(re.findall(r"!\[(\w+)\]\(figures/experts/\1\.png\)", text)) == sorted(shipped)
+    assert sum(path.stat().st_size for path in (ROOT / "docs" / "figures" / "experts").iterdir()) < 400_000
+
+
 def test_the_pictures_are_of_the_tasks_as_they_are() -> None:
     """Drawn anew, one is the same but for the colours that a small file has."""
     script = ROOT / "docs" / "figures" / "make_tasks.py"

@@ -72,11 +72,7 @@ def scene(name: str, view: View) -> tuple[Any, Any, list[Disc]]:
     model, data = env.model, mujoco.MjData(env.model)
     if isinstance(env, SafetyGym):
         state = env.reset(jax.random.key(view.seed))
-        for array, value in env.engine_arrays(state).items():
-            getattr(data, array)[:] = value
-        mujoco.mj_kinematics(model, data)
-        places, flat = env.situation(state.physics).objects, [k for k in env.task.objects if k.shape == "none"]
-        return model, data, [(np.asarray(at[:2]), k.size, KINDS[k.name]) for k in flat for at in places[k.name]]
+        return model, placed(env, state), flat_objects(env, state)
     for joint, angle in view.joints.items():
         data.joint(joint).qpos[0] = angle
     mujoco.mj_kinematics(model, data)
@@ -86,6 +82,21 @@ def scene(name: str, view: View) -> tuple[Any, Any, list[Disc]]:
         data.qpos[height] -= min(mujoco.mj_geomDistance(model, data, 0, geom, 10.0, None) for geom in geoms)
         mujoco.mj_kinematics(model, data)
     return model, data, []
+
+
+def placed(env: Any, state: Any) -> Any:
+    """MuJoCo's data with the bodies where they are in `state`."""
+    data = mujoco.MjData(env.model)
+    for array, value in env.engine_arrays(state).items():
+        getattr(data, array)[:] = value
+    mujoco.mj_kinematics(env.model, data)
+    return data
+
+
+def flat_objects(env: SafetyGym, state: Any) -> list[Disc]:
+    """The objects of Safety Gym that have no body: its goal and hazards."""
+    places, flat = env.situation(state.physics).objects, [k for k in env.task.objects if k.shape == "none"]
+    return [(np.asarray(at[:2]), k.size, KINDS[k.name]) for k in flat for at in places[k.name]]
 
 
 def cast(model: Any, data: Any, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -133,12 +144,41 @@ def draw(name: str, size: tuple[int, int] = SIZE) -> Image.Image:
     """The picture of a task, `size` pixels wide and high."""
     view = VIEWS[name]
     model, data, discs = scene(name, view)
+    return expose(model, [data], discs, view, size)
+
+
+def expose(model: Any, moments: Sequence[Any], discs: Sequence[Disc], view: View, size: tuple[int, int]) -> Image.Image:
+    """A picture of the bodies at several moments, each given by MuJoCo's data, as if exposed at each of them.
+
+    Args:
+        model: MuJoCo's.
+        moments: in the order of time; earlier ones are paler.
+        discs: on the floor.
+        view: where the camera stands.
+        size: pixels of width and height.
+    """
     width, height = SAMPLES * size[0], SAMPLES * size[1]
     origin, rays = camera(view, (width, height))
     rays = rays.reshape(-1, 3)
+    nearest, bodies, rest = np.full(len(rays), np.inf), np.ones(rays.shape), np.ones(rays.shape)
+    for number, data in enumerate(moments, 1):
+        is_body, distances, color = light_up(model, data, discs, view, origin, rays)
+        rest = np.where(is_body[:, None], rest, np.minimum(rest, color))  # the shadows of all moments
+        nearer = is_body & (distances <= nearest)
+        strength = number / len(moments)
+        bodies[nearer] = (strength * color + (1 - strength) * np.array(to_rgb(SKY)))[nearer]
+        nearest[nearer] = distances[nearer]
+    color = np.where(np.isfinite(nearest)[:, None], bodies, rest)
+    pixels = color.reshape(size[1], SAMPLES, size[0], SAMPLES, 3).mean(axis=(1, 3))
+    return Image.fromarray(np.round(255 * pixels).astype(np.uint8))
+
+
+def light_up(
+    model: Any, data: Any, discs: Sequence[Disc], view: View, origin: np.ndarray, rays: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether each of the rays [N, 3] from `origin` meets a body, at what distance, and the colour it sees, [N, 3]."""
     geoms, distances, normals = cast(model, data, origin, rays)
     points = origin + np.where(geoms >= 0, distances, 0.0)[:, None] * rays
-
     lamp = np.array(view.at) + view.distance * np.array([-0.5, -0.6, 1.3])
     to_points = points - lamp
     reach = np.linalg.norm(to_points, axis=1, keepdims=True)
@@ -149,8 +189,12 @@ def draw(name: str, size: tuple[int, int] = SIZE) -> Image.Image:
     color = np.clip(colors(model, geoms, points, discs) * light[:, None], 0.0, 1.0)
     haze = np.where(geoms == 0, np.clip((distances / view.distance - 1.2) / 2.5, 0.0, 1.0), 0.0)[:, None]
     color = (1 - haze) * color + haze * np.array(to_rgb(SKY))  # far away the floor becomes the sky
-    pixels = color.reshape(size[1], SAMPLES, size[0], SAMPLES, 3).mean(axis=(1, 3))
-    return Image.fromarray(np.round(255 * pixels).astype(np.uint8))
+    return geoms > 0, distances, color
+
+
+def save(picture: Image.Image, path: Path) -> None:
+    """Writes a picture as a small file."""
+    picture.quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> None:
@@ -161,8 +205,7 @@ def main() -> None:
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.tasks or VIEWS:
-        picture = draw(name).quantize(PALETTE, Image.Quantize.MAXCOVERAGE, kmeans=4, dither=Image.Dither.NONE)
-        picture.save(arguments.out / f"{name}.png", optimize=True)
+        save(draw(name), arguments.out / f"{name}.png")
 
 
 if __name__ == "__main__":
