@@ -29,9 +29,11 @@ from experiments.runs.resuming import resumed
 
 DEFAULTS = {**options.DEFAULTS, "preset": "expert"}
 # Fields that may change with --resume: an expert that misses its limit can be trained on with another limit, with a
-# multiplier that reacts more strongly, or with smaller steps, where its cost scatters from one policy to the next.
+# multiplier that reacts more strongly, with smaller steps, where its cost scatters from one policy to the next, or with
+# another horizon of the cost.
 MOVABLE = (
     "cost_limit",
+    "cost_gamma",
     "max_kl",
     "multiplier_learning_rate",
     "multiplier_max",
