@@ -473,6 +473,7 @@ def test_an_expert_goes_on_under_another_limit(pipeline: Path, tmp_path: Path) -
     shutil.copytree(pipeline / "expert", tmp_path / "expert")
     made = ["--out", f"{tmp_path}/e.npz", "--run-dir", f"{tmp_path}/expert", "--resume"]
     more = ["--cost-limit", "19", "--multiplier-learning-rate", "0.5", "--max-kl", "0.001", "--env-steps", "360"]
+    more += ["--cost-gamma", "0.5"]
     assert expert.main([*made, *more, "--num-trajectories", "2"]) == 0
     before, after = (read_metrics(folder / "expert") for folder in (pipeline, tmp_path))
     assert len(before["env_steps"]) < len(after["env_steps"])
@@ -480,6 +481,7 @@ def test_an_expert_goes_on_under_another_limit(pipeline: Path, tmp_path: Path) -
         np.testing.assert_array_equal(after[name][: len(rows)], rows)
     config = run_folder.read_run(tmp_path / "expert").config
     assert (config.cost_limit, config.multiplier_learning_rate, config.max_kl) == (19.0, 0.5, 0.001)
+    assert config.cost_gamma == 0.5
     facts = load_demonstrations(tmp_path / "e.npz").metadata
     assert (facts["cost_limit"], facts["limit_kept"]) == (19.0, True)
     assert len(facts["command"].splitlines()) == 2
