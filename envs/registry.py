@@ -82,7 +82,7 @@ _ROWS = (
         "Humanoid",
         (270, 17),
         0.2,
-        40.0,
+        200.0,
         "0.1 * sum of squared actions + contact cost",
         contact=True,
         reward_lacks=_BOTH,

@@ -128,8 +128,8 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "--num-demos 99: ",
     ),
     "nothing shipped": (
-        ("train", "--method", "malm", "--env", "Humanoid"),
-        "no demonstrations are shipped for Humanoid",
+        ("train", "--method", "malm", "--env", "DoggoButton1"),
+        "no demonstrations are shipped for DoggoButton1",
     ),
     "output under a file": ((*TRAIN, "--out", "good.npz/run"), "--out good.npz/run: cannot be "),
     "output a file": ((*TRAIN, "--out", "good.npz"), "--out good.npz: cannot be written (File exists)"),
@@ -155,13 +155,13 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "evaluate two": (("evaluate", "done", "--policy", "good.npz"), "RUN_DIR: give the folder of a run, or --policy"),
     "evaluate no policy": (("evaluate", "--policy", "none.npz"), "none.npz: no such file; check the path"),
     "evaluate an expert that is not shipped": (
-        ("evaluate", "--policy", "Humanoid"),
-        "--policy Humanoid: no such file, and no expert of that name is shipped (shipped: Ant, CarGoal1,",
+        ("evaluate", "--policy", "DoggoButton1"),
+        "--policy DoggoButton1: no such file, and no expert of that name is shipped (shipped: Ant, CarGoal1,",
     ),
     "evaluate an unknown expert": (("evaluate", "--policy", "Hoper"), "did you mean Hopper? correct the path or the"),
     "show an expert that is not shipped": (
-        ("report", "--policies", "Humanoid", "--out", "new.html"),
-        "train one with `python -m experiments.expert --env Humanoid --out Humanoid.npz --export Humanoid_policy.npz`",
+        ("report", "--policies", "DoggoButton1", "--out", "new.html"),
+        "`python -m experiments.expert --env DoggoButton1 --out DoggoButton1.npz --export DoggoButton1_policy.npz`",
     ),
     "a rule of the multiplier of one's own": (
         ("train", "--method", "ccil", "--env", "Swimmer", "--multiplier-update", "my_methods:rule"),
