@@ -41,7 +41,7 @@ COURSES = {
     "Hopper": Course(gap=0.8, distance=3.9),
     "Walker2d": Course(gap=0.8, distance=3.9),
     "Ant": Course(gap=1.6, distance=4.8),
-    "Humanoid": Course(gap=0.9, distance=4.2),
+    "Humanoid": Course(gap=0.9, distance=5.6),
 }
 FIRST = 60  # step from which on a robot is shown: it has begun to move
 ARRIVED = 0.9  # a reward above this has the bonus of 1 for reaching a goal or pressing a button
