@@ -20,7 +20,6 @@ from ccil_jax.acting import networks
 from ccil_jax.acting.rollout import act
 from experiments.policies import policy_file
 
-EXPERTS = Path(__file__).parents[2] / "experiments" / "experts"
 FOLDER = Path(__file__).parent / "experts"
 WIDE, SQUARE = (840, 220), (420, 380)  # pixels
 EXPOSURES = 6
@@ -50,7 +49,7 @@ ARRIVED = 0.9  # a reward above this has the bonus of 1 for reaching a goal or p
 def load(name: str) -> tuple[Any, Any]:
     """The environment, and a function from a seed to the states of an episode of the shipped expert."""
     env = envs.make(name, physics="native")
-    file = policy_file.read(EXPERTS / f"{name}.npz")
+    file = policy_file.read(policy_file.shipped() / f"{name}.npz")
     apply = networks.policy_of(file.config, env).apply
     actor = jax.tree.map(lambda leaf: leaf[0], file.actor())
     reset = jax.jit(env.reset)
@@ -94,8 +93,8 @@ def draw_arena(name: str) -> Image.Image:
         states = list(itertools.takewhile(lambda state: state.reward < ARRIVED, episode(seed)))
         if len(states) < env.max_episode_steps:
             break
-    robot = env.model.body("robot").id
-    trail: list[Disc] = [(placed(env, state).xpos[robot, :2].copy(), 0.025, TRAIL) for state in states[::4]]
+    way = [np.asarray(env.situation(state.physics).robot[:2]) for state in states[::4]]
+    trail: list[Disc] = [(place, 0.025, TRAIL) for place in way]
     moments = [placed(env, states[round(i)]) for i in np.linspace(0, len(states) - 1, EXPOSURES)]
     distance = 7.2 if "Push" in name else 5.8  # boxes are pushed beyond the square in which a layout is drawn
     view = dataclasses.replace(VIEWS[name], at=(0.0, 0.0, 0.0), distance=distance, elevation=62)
@@ -105,7 +104,7 @@ def draw_arena(name: str) -> Image.Image:
 def main() -> None:
     """Writes the pictures of the experts that the command line names, or of all."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    shipped = [name for name in VIEWS if (EXPERTS / f"{name}.npz").is_file()]
+    shipped = [name for name in VIEWS if (policy_file.shipped() / f"{name}.npz").is_file()]
     parser.add_argument("tasks", nargs="*", choices=[*shipped, []], metavar="TASK", help="tasks (default: all shipped)")
     parser.add_argument("--out", type=Path, default=FOLDER, metavar="FOLDER", help="folder of the pictures")
     arguments = parser.parse_args()
