@@ -1,5 +1,6 @@
 """What films show: the engine's bodies and objects, and the episode's own return and cost."""
 
+import dataclasses
 import types
 from pathlib import Path
 from typing import Any
@@ -197,6 +198,26 @@ def test_a_robot_of_ones_own_is_drawn_as_mujoco_sees_it(robot: Locomotion) -> No
         seen = seen_by_rays(robot, np.asarray(there.physics.qpos), shown, index)
         assert seen.sum() > 500
         assert (drawn_there & seen).sum() > 0.9 * (drawn_there | seen).sum()
+
+
+def test_what_is_fixed_is_drawn_behind_the_bodies_where_it_stands(robot: Locomotion, tmp_path: Path) -> None:
+    """A rail and a wall of the world; the picture follows the bodies as it does without them."""
+    path = tmp_path / "robot.xml"
+    fixed = '<geom type="capsule" fromto="-3 0 1 5 0 1" size=".05"/><geom type="box" size=".1 1 .4" pos="7 0 .4"/>'
+    path.write_text(ROBOT.replace("<worldbody>", f"<worldbody>{fixed}"), encoding="utf-8")
+    railed = Locomotion(
+        dataclasses.replace(robot.task, xml=str(path)), name="Railed", physics="native", cost_threshold=0.1
+    )
+    qpos = {"qpos": np.tile(robot.model.qpos0, (3, 1)) + np.array([[0.0], [0.1], [0.2]])}
+    plain, shown = (film._make(env, qpos, {}, np.zeros(3), np.zeros(3)) for env in (robot, railed))
+    assert [shape.kind for shape in shown.strokes.shapes[:3]] == ["scenery", "scenery", "body"]
+    assert [shape.width for shape in shown.strokes.shapes[:2]] == pytest.approx([0.1, 0.2])
+    rail, wall = (np.sort(shown.strokes.places[:, i].reshape(3, 2, 2), axis=1) for i in range(2))
+    np.testing.assert_allclose(rail, np.tile([[-3, 1], [5, 1]], (3, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(wall, np.tile([[7, 0], [7, 0.8]], (3, 1, 1)), atol=1e-6)
+    np.testing.assert_array_equal(shown.strokes.places[:, 2:], plain.strokes.places)
+    np.testing.assert_array_equal(shown.centre, plain.centre)
+    assert shown.span == plain.span
 
 
 def test_where_the_physics_has_failed_the_last_frame_repeats_a_pose(robot: Locomotion) -> None:

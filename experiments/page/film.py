@@ -19,6 +19,7 @@ from experiments.policies.evaluating import Loaded
 
 View = Literal["side", "above", "arena"]
 _FRAME_SECONDS = 0.035  # that a frame lasts at least: some 25 frames a second
+_WORLD = 0  # the body of a MuJoCo model that holds what is fixed
 _MARGIN = 0.4  # m around everything that is seen of an arena
 
 
@@ -155,9 +156,10 @@ def _make(
         centre = np.zeros((len(steps), 2))
         span = 2 * (max(ARENA, float(np.abs(strokes.places).max())) + _MARGIN)
     else:
-        moving = dict.fromkeys(range(1, env.model.nbody), "body")
-        strokes = bodies(env.model, arrays, moving, above=view == "above")
+        above = view == "above"
+        strokes = bodies(env.model, arrays, dict.fromkeys(range(1, env.model.nbody), "body"), above=above)
         centre, span = _follow(strokes, view)
+        strokes = strokes.over(bodies(env.model, arrays, {_WORLD: "scenery"}, above=above))  # walls and rails
     return Film(
         view=view,
         strokes=strokes,

@@ -19,6 +19,7 @@ _BOX, _ELLIPSOID, _MESH = int(_GEOM.mjGEOM_BOX), int(_GEOM.mjGEOM_ELLIPSOID), in
 _SIMPLE = (_SPHERE, _CAPSULE, _CYLINDER, _BOX, _ELLIPSOID)
 PAID = "#d1495b"  # the learner's body while it pays a cost
 COLORS = {  # by kind; the last two digits are the opacity
+    "scenery": "#8a8f9866",
     "body": "#0b6e99ff",
     "robot": "#22262bff",
     "hazards": "#3f6fb573",
@@ -90,7 +91,8 @@ def bodies(
         mujoco.mj_kinematics(model, data)
         rotations = data.geom_xmat[geoms].reshape(-1, 3, 3)
         lines = lines or [_line(model, geom, turned[plane]) for geom, turned in zip(geoms, rotations, strict=True)]
-        ends = data.geom_xpos[geoms][:, None] + np.array([line.ends for line in lines]) @ rotations.swapaxes(1, 2)
+        own = np.array([line.ends for line in lines]).reshape(-1, 2, 3)
+        ends = data.geom_xpos[geoms][:, None] + own @ rotations.swapaxes(1, 2)
         places.append(ends[:, :, plane].reshape(len(geoms), 4))
     shapes = (
         Shape(kind_of[model.geom_bodyid[geom]], line.width, line.is_round)

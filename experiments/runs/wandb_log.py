@@ -86,7 +86,9 @@ class WandbWriter:
 
     def finish(self, summary: Mapping[str, Any]) -> None:
         """Logs the scores of the evaluation, of each seed and their mean; `summary` is the content of summary.json."""
-        of_seeds = {f"seed_{row['seed']}/{name}": row[name] for row in summary["per_seed"] for name in row}
+        of_seeds = {
+            f"seed_{row['seed']}/{name}": row[name] for row in summary["per_seed"] for name in row if name != "seed"
+        }
         means = {f"mean/{name}": score and score["mean"] for name, score in summary["aggregate"].items()}
         scores = {**of_seeds, **means}
         self._run.summary.update({f"evaluation/{name}": score for name, score in scores.items() if score is not None})
