@@ -193,7 +193,9 @@ class Config:
         "none",
         "what is evaluated and recorded in the end: none is the policy of the last iteration, polynomial_decay the "
         "average of the parameters of all iterations, those of iteration k weighed by k^policy_average_power, so that "
-        "the noise of single steps cancels (Shamir and Zhang 2013); rollouts are of the newest policy either way",
+        "the noise of single steps cancels (Shamir and Zhang 2013); rollouts are of the newest policy either way. "
+        "Cloning averages over its gradient steps in the same way (Block et al. 2024)",
+        GAUSSIAN,
     )
     critic_intervals: int = _static(
         0,
@@ -279,7 +281,8 @@ class Config:
     critic_lambda: float = _traced(0.97, "lambda of the critics' targets", TD_LAMBDA)
     policy_average_power: float = _traced(
         6.0,
-        "how fast older policies fade from the average; with n about the last 1/(n+1) of the iterations count",
+        "how fast older policies fade from the average; with n about the last 1/(n+1) of the iterations count, or "
+        "of the gradient steps of cloning",
         AVERAGED,
     )
     max_kl: float = _traced(0.01, "radius of the trust region: KL divergence from the old policy, nats (Table 1)")

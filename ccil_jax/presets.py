@@ -106,6 +106,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "action_likelihood": "censored",
         "mirrored_demonstrations": "symmetric_tasks",
         "cloning_updates": 20_000,
+        "policy_average": "polynomial_decay",
     },
     # As published, except for the length: 60,000 steps with as many updates were enough on HalfCheetah.
     "iq_learn": {

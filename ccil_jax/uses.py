@@ -45,8 +45,8 @@ TD_LAMBDA = Use(
     lambda config: config.critic_target == "td_lambda",
 )
 AVERAGED = Use(
-    ON_POLICY.reads,
-    "on-policy methods whose policy_average is polynomial_decay",
+    lambda row: row.agent in ("on_policy", "behavior_cloning"),
+    "methods with a Gaussian policy whose policy_average is polynomial_decay",
     lambda config: config.policy_average == "polynomial_decay",
 )
 IMITATING = Use(lambda row: row.imitates, "every method that imitates ({methods})")

@@ -7,7 +7,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
 
+from ccil_jax.acting import networks
 from ccil_jax.acting.running_statistics import normalize
 from ccil_jax.agents import behavior_cloning, build
 from ccil_jax.agents.expert import expert_data
@@ -102,17 +105,51 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
     assert float(state.held_out_loss) == losses[best]
 
 
-def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path) -> None:
+def test_an_average_of_all_gradient_steps_is_judged_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its weights are those of polynomial decay, k for power 1; the steps themselves are those without an average."""
+    monkeypatch.setattr(behavior_cloning, "CLONING_UPDATES_PER_ITERATION", 1)
+    demonstrations, env, runs = linear_expert(200), Walk(), {}
+    expert = expert_data(demonstrations)
+    assert expert is not None
+    for average in ({}, {"policy_average": "polynomial_decay", "policy_average_power": 1.0}):
+        config = build.resolve(walk_config(method="bc", cloning_updates=100, **average), env, demonstrations)
+        agent = behavior_cloning.make(config, env, expert)
+        step = jax.jit(agent.step)
+        states, losses = [jax.jit(agent.init)(jax.random.key(1))], []
+        for _ in range(12):
+            state, metrics = step(states[-1])
+            states.append(state)
+            losses.append(float(metrics["held_out_loss"]))
+        runs[bool(average)] = states[1:], losses
+    (plain, newest_losses), (averaging, losses) = runs[False], runs[True]
+    newest = [ravel_pytree(state.params)[0] for state in plain]
+    policy = networks.with_likelihood(config, env, networks.policy_of(config, env))
+    obs = normalize(plain[0].actor.obs_statistics, expert.held_out_obs)
+    for k, state in enumerate(averaging, start=1):
+        assert isinstance(state, behavior_cloning.AveragingState)
+        np.testing.assert_allclose(ravel_pytree(state.params)[0], newest[k - 1], rtol=1e-4, atol=1e-6)
+        expected = np.average(newest[:k], axis=0, weights=np.arange(1, k + 1))
+        np.testing.assert_allclose(ravel_pytree(state.average)[0], expected, rtol=1e-4, atol=1e-6)
+        loss = behavior_cloning.negative_log_likelihood(policy.apply, state.average, obs, expert.held_out_action)
+        np.testing.assert_allclose(losses[k - 1], loss, rtol=1e-5)
+    assert_same_bits(averaging[-1].actor.policy_params, averaging[int(np.argmin(losses))].average)
+    assert np.abs(np.subtract(losses, newest_losses)).max() > 1e-3
+    assert not any(isinstance(state, behavior_cloning.AveragingState) for state in plain)
+
+
+@pytest.mark.parametrize("average", ["none", "polynomial_decay"])
+def test_a_stopped_and_resumed_run_is_the_unbroken_run(tmp_path: Path, average: str) -> None:
+    own = walk_config(method="bc", cloning_updates=2_000, policy_average=average)
+
     def train(directory: Path | None = None, **options: Any) -> runner.Result:
-        config = walk_config(method="bc", cloning_updates=2_000)
         demonstrations = walk_demonstrations()
         with quick_compilation():
-            return runner.train(config, Walk(), demonstrations, num_seeds=2, checkpoint_dir=directory, **options)
+            return runner.train(own, Walk(), demonstrations, num_seeds=2, checkpoint_dir=directory, **options)
 
     whole = train()
     train(tmp_path, stop_after=10)
     resumed = train(tmp_path, resume=True)
     assert_same_bits(resumed.state, whole.state)
     assert_same_bits({name: resumed.metrics[name] for name in whole.metrics}, whole.metrics)
-    loaded = runner.load(walk_config(method="bc", cloning_updates=2_000), Walk(), tmp_path, 2)
+    loaded = runner.load(own, Walk(), tmp_path, 2)
     assert_same_bits(loaded.actor, whole.actor)

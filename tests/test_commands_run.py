@@ -51,6 +51,7 @@ NOT_CARRIED_OUT = {  # how a command begins that is not carried out here, and wh
     ".venv-peers": "environments of other projects",
     "python -m experiments.benchmark --peers": "needs these environments",
     "python tests/golden/run_policy.py": "needs safety-gymnasium in an environment of its own",
+    "python -m experiments.expert --resume --run-dir runs/Humanoid --env-steps 6000000": "the run has been stopped",
     "python -m experiments.replay_fault": "needs a run that a fault ended; `test_faults.py` has one",
     "minari download": "needs a network",
     "tensorboard ": "a server that does not end",

@@ -40,6 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {name: {"method": name} for name in METHOD
     "gail that begins with a clone": {"method": "gail", "cloning_updates": 200},
     "gail with targets of their own": {"method": "gail", "critic_target": "td_lambda"},
     "gail that averages": {"method": "gail", "policy_average": "polynomial_decay"},
+    "bc that averages": {"method": "bc", "cloning_updates": 200, "policy_average": "polynomial_decay"},
     "iq_learn that begins with a clone": {"method": "iq_learn", "cloning_updates": 200},
     "malm with the coherent reward": {"method": "malm", "cloning_updates": 200, "imitation_reward": "coherent"},
     "gail with the coherent reward": {"method": "gail", "cloning_updates": 200, "imitation_reward": "coherent"},

@@ -35,9 +35,9 @@ def test_value_k_weighs_k_to_the_power(power: int) -> None:
 
 
 def states(length: int, **changes: Any) -> list[AgentState]:
-    """Before the first iteration, and after each."""
+    """Before the first iteration, and after each. No clone comes first: it would be an average of its own."""
     demonstrations = walk_demonstrations()
-    config = build.resolve(walk_config(method="malm", cloning_updates=100, **changes), Walk(), demonstrations)
+    config = build.resolve(walk_config(method="malm", **changes), Walk(), demonstrations)
     with quick_compilation():
         agent = build.make_agent(config, Walk(), demonstrations)
         found = [jax.jit(agent.init)(jax.random.key(2))]

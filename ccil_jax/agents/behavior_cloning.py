@@ -1,5 +1,7 @@
 """Behaviour cloning: the most likely policy given the demonstrations' actions, with held-out early stopping."""
 
+import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -13,7 +15,7 @@ from ccil_jax.acting.networks import Policy, SquashedPolicy
 from ccil_jax.acting.rollout import Actor
 from ccil_jax.acting.running_statistics import RunningStatistics
 from ccil_jax.agents import contracts
-from ccil_jax.agents.base import Agent
+from ccil_jax.agents.base import Agent, polynomial_decay_mean
 from ccil_jax.config import CLONING_UPDATES_PER_ITERATION, Config
 from ccil_jax.learning.optimizers import Optimizer, adam
 from ccil_jax.types import ExpertData, Metrics, PyTree
@@ -32,6 +34,14 @@ class AgentState:
     params: PyTree  # still training
     optimizer: PyTree
     key: jax.Array
+
+
+@struct.dataclass(kw_only=True)
+class AveragingState(AgentState):
+    """Where the policy is an average. A class of its own: checkpoints of others have no such parts."""
+
+    average: PyTree  # of `params` after every gradient step so far
+    updates: jax.Array  # [] int32 gradient steps so far
 
 
 def negative_log_likelihood(
@@ -89,8 +99,12 @@ def descent(
 ) -> Agent:
     """The cloning of any policy; an iteration is `CLONING_UPDATES_PER_ITERATION` gradient steps.
 
+    With the `policy_average` polynomial_decay, what is held against the held-out steps, and kept, is an average of the
+    parameters after all gradient steps so far. The noise of single steps hardly shows in the likelihood, but grows over
+    an episode (Block et al. 2024).
+
     Args:
-        config: the learning rate and the size of a minibatch.
+        config: the learning rate, the size of a minibatch and the average.
         policy: with the likelihood that is to be maximised.
         expert: the demonstrations; the held-out steps tell which parameters are kept.
         statistics: of observations, to normalise what the policy gets; None where it gets them as they are.
@@ -104,7 +118,7 @@ def descent(
     def init(key: jax.Array) -> AgentState:
         key, policy_key = jax.random.split(key)
         params = policy.init(policy_key)
-        return AgentState(
+        state = AgentState(
             # Buffers of its own: those of the parameters still training are donated too.
             actor=Actor(policy_params=jax.tree.map(jnp.copy, params), obs_statistics=statistics),
             held_out_loss=jnp.asarray(jnp.inf),
@@ -112,32 +126,36 @@ def descent(
             optimizer=rule.init(params),
             key=key,
         )
+        if not (config.reads("policy_average") and config.policy_average == "polynomial_decay"):
+            return state
+        average, updates = jax.tree.map(jnp.copy, params), jnp.zeros((), jnp.int32)
+        return AveragingState(**state.__dict__, average=average, updates=updates)
 
-    def descend(learner: tuple[PyTree, PyTree], indices: jax.Array) -> tuple[tuple[PyTree, PyTree], jax.Array]:
-        params, optimizer_state = learner
+    def descend(state: AgentState, indices: jax.Array) -> tuple[AgentState, jax.Array]:
         loss, gradient = jax.value_and_grad(negative_log_likelihood, argnums=1)(
-            apply, params, obs[indices], expert.action[indices]
+            apply, state.params, obs[indices], expert.action[indices]
         )
-        change, optimizer_state = rule.update(gradient, optimizer_state, params)
-        params = optax.apply_updates(params, change)
-        return (_keep_wide(params), optimizer_state), loss
+        change, optimizer_state = rule.update(gradient, state.optimizer, state.params)
+        params = _keep_wide(optax.apply_updates(state.params, change))
+        new = dataclasses.replace(state, params=params, optimizer=optimizer_state)
+        if isinstance(new, AveragingState):
+            updates = new.updates + 1
+            mean = functools.partial(polynomial_decay_mean, count=updates, power=config.policy_average_power)
+            new = dataclasses.replace(new, average=jax.tree.map(mean, new.average, params), updates=updates)
+        return new, loss
 
     def step(state: AgentState) -> tuple[AgentState, Metrics]:
         key, minibatch_key = jax.random.split(state.key)
         minibatches = jax.random.randint(
             minibatch_key, (CLONING_UPDATES_PER_ITERATION, minibatch_size), 0, obs.shape[0]
         )
-        (params, optimizer_state), losses = jax.lax.scan(descend, (state.params, state.optimizer), minibatches)
+        new, losses = jax.lax.scan(descend, dataclasses.replace(state, key=key), minibatches)
+        params = new.average if isinstance(new, AveragingState) else new.params
         held_out = negative_log_likelihood(apply, params, held_out_obs, expert.held_out_action)
         better = held_out < state.held_out_loss
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), params, state.actor.policy_params)
-        new = AgentState(
-            actor=Actor(policy_params=best, obs_statistics=statistics),
-            held_out_loss=jnp.minimum(held_out, state.held_out_loss),
-            params=params,
-            optimizer=optimizer_state,
-            key=key,
-        )
+        actor = Actor(policy_params=best, obs_statistics=statistics)
+        new = dataclasses.replace(new, actor=actor, held_out_loss=jnp.minimum(held_out, state.held_out_loss))
         return new, {"loss": jnp.mean(losses), "held_out_loss": held_out}
 
     return Agent(init, step)
