@@ -40,6 +40,7 @@ from ccil_jax.uses import (
     ON_POLICY,
     PENALIZED,
     PID,
+    SELECTING,
     SGD,
     STANDARDIZED,
     TD_LAMBDA,
@@ -64,6 +65,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "critic_target": ("gae", "td_lambda"),
     "policy_average": ("none", "polynomial_decay"),
+    "cloning_selection": ("lowest", "one_standard_error"),
     "mirrored_demonstrations": ("none", "symmetric_tasks"),
     "value_loss": ("value", "v0"),
 }
@@ -244,9 +246,16 @@ class Config:
     cloning_updates: int = _static(
         0,
         "gradient steps in which the policy is cloned from the demonstrations before anything else is learnt, rounded "
-        "up to hundreds; for bc each hundred is an iteration. The policy that is kept is the one that is best on the "
-        "held-out tenth of the demonstrations",
+        "up to hundreds; for bc each hundred is an iteration. The policy that is kept is chosen on the held-out tenth "
+        "of the demonstrations",
         CLONING,
+    )
+    cloning_selection: str = _static(
+        "lowest",
+        "which policy of the cloning is kept: lowest is that of the lowest loss on the held-out steps, "
+        "one_standard_error the newest whose loss is at most a standard error above it, because longer cloning makes "
+        "rollouts better where the held-out loss can hardly tell",
+        SELECTING,
     )
     warmup_iterations: int = _static(
         0, "first iterations in which the policy stays as it is, while critics and discriminator learn from it", CLONED

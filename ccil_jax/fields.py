@@ -44,6 +44,7 @@ class Fields(TypedDict, total=False):
     action_likelihood: str
     mirrored_demonstrations: str
     cloning_updates: int
+    cloning_selection: str
     warmup_iterations: int
     replay_size: int
     updates_per_step: int

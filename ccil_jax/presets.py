@@ -30,6 +30,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "mirrored_demonstrations": "symmetric_tasks",
         "action_likelihood": "censored",
         "cloning_updates": 20_000,
+        "cloning_selection": "one_standard_error",
         "warmup_iterations": 5,
         "cloning_weight": None,
         "standardize_cost_advantage": True,
@@ -106,6 +107,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "action_likelihood": "censored",
         "mirrored_demonstrations": "symmetric_tasks",
         "cloning_updates": 20_000,
+        "cloning_selection": "one_standard_error",
         "policy_average": "polynomial_decay",
     },
     # As published, except for the length: 60,000 steps with as many updates were enough on HalfCheetah.

@@ -111,6 +111,7 @@ CLONED = Use(
     "{methods} whose cloning_updates are above 0",
     lambda config: config.cloning_updates > 0,
 )
+SELECTING = Use(CLONING.reads, CLONED.note, CLONED.where)
 IQ_LEARN = Use(lambda row: row.agent == "iq_learn")
 ACTOR = Use(
     CLONING.reads,

@@ -105,6 +105,37 @@ def test_what_acts_was_best_on_the_held_out_steps() -> None:
     assert float(state.held_out_loss) == losses[best]
 
 
+def test_of_policies_that_the_held_out_steps_cannot_tell_apart_the_newest_is_kept() -> None:
+    """The loss of each is compared with the lowest so far plus its standard error, in NumPy."""
+    demonstrations, env = linear_expert(100), Walk()
+    own = {"hidden_sizes": (32,), "critic_minibatch_size": 9, "actor_learning_rate": 0.001}
+    config = build.resolve(
+        walk_config(method="bc", cloning_updates=2_000, cloning_selection="one_standard_error", **own),
+        env,
+        demonstrations,
+    )
+    expert = expert_data(demonstrations)
+    assert expert is not None
+    agent = behavior_cloning.make(config, env, expert)
+    state, step, losses, bars, seen, kept = jax.jit(agent.init)(jax.random.key(1)), jax.jit(agent.step), [], [], [], []
+    obs = normalize(state.actor.obs_statistics, expert.held_out_obs)
+    for k in range(60):
+        state, metrics = step(state)
+        mean, log_std = numpy_policy(state.params, obs)
+        residual = (np.asarray(expert.held_out_action) - mean) / np.exp(log_std)
+        each = np.sum(residual**2 / 2 + log_std + np.log(2 * np.pi) / 2, axis=-1)
+        np.testing.assert_allclose(metrics["held_out_loss"], each.mean(), rtol=1e-4)
+        losses.append(each.mean())
+        bars.append(each.mean() + each.std() / np.sqrt(len(each)))
+        np.testing.assert_allclose(state.held_out_loss, min(bars), rtol=1e-4)
+        seen.append(state.params)
+        if losses[-1] <= min(bars):
+            kept.append(k)
+        assert_same_bits(state.actor.policy_params, seen[kept[-1]])
+    assert kept[-1] > np.argmin(losses)  # not the lowest
+    assert len(kept) < 60  # nor simply the last
+
+
 def test_an_average_of_all_gradient_steps_is_judged_and_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its weights are those of polynomial decay, k for power 1; the steps themselves are those without an average."""
     monkeypatch.setattr(behavior_cloning, "CLONING_UPDATES_PER_ITERATION", 1)

@@ -72,6 +72,7 @@ OTHER: dict[str, Any] = {  # another value of each static field that narrows wha
     "bootstrap_at_truncation": False,
     "action_likelihood": "censored",
     "cloning_updates": 300,
+    "cloning_selection": "one_standard_error",
     "warmup_iterations": 2,
     "critic_target": "td_lambda",
     "normalize_values": True,

@@ -29,8 +29,8 @@ SMALLEST_LOG_STD = -4.0  # the likelihood of an action that the expert never var
 class AgentState:
     """Everything one seed needs to continue exactly."""
 
-    actor: Actor  # the parameters that were best on the held-out steps so far
-    held_out_loss: jax.Array  # [] theirs
+    actor: Actor  # the parameters that are kept so far
+    held_out_loss: jax.Array  # [] what parameters may have on the held-out steps to be kept
     params: PyTree  # still training
     optimizer: PyTree
     key: jax.Array
@@ -51,7 +51,17 @@ def negative_log_likelihood(
     action: jax.Array,
 ) -> jax.Array:
     """Mean over the samples [M], nats."""
-    return -jnp.mean(distributions.log_prob(apply(params, obs), action))
+    return jnp.mean(negative_log_likelihoods(apply, params, obs, action))
+
+
+def negative_log_likelihoods(
+    apply: Callable[[PyTree, jax.Array], Gaussian | CensoredGaussian | TanhGaussian],
+    params: PyTree,
+    obs: jax.Array,
+    action: jax.Array,
+) -> jax.Array:
+    """[M] of the samples, nats."""
+    return -distributions.log_prob(apply(params, obs), action)
 
 
 def _keep_wide(params: PyTree) -> PyTree:
@@ -85,7 +95,7 @@ def make(
 
 
 def learn(cloning: Agent, num_iterations: int, key: jax.Array) -> Actor:
-    """The clone after so many iterations of `make` or `descent`: what was best on the held-out steps."""
+    """The clone after so many iterations of `make` or `descent`: what was kept for its held-out loss."""
     state, _ = scan(lambda state, _: cloning.step(state), cloning.init(key), jnp.arange(num_iterations))
     return state.actor
 
@@ -103,8 +113,13 @@ def descent(
     parameters after all gradient steps so far. The noise of single steps hardly shows in the likelihood, but grows over
     an episode (Block et al. 2024).
 
+    With the `cloning_selection` one_standard_error, the newest parameters are kept whose held-out loss is at most the
+    lowest so far plus its standard error. The steps of an episode are taken as independent for that, so it is rather
+    small. The loss hardly changes over many gradient steps in which the mean action still becomes more exact, in states
+    that are rare in the demonstrations and decide how a rollout goes on.
+
     Args:
-        config: the learning rate, the size of a minibatch and the average.
+        config: the learning rate, the size of a minibatch, the average and the selection.
         policy: with the likelihood that is to be maximised.
         expert: the demonstrations; the held-out steps tell which parameters are kept.
         statistics: of observations, to normalise what the policy gets; None where it gets them as they are.
@@ -151,11 +166,13 @@ def descent(
         )
         new, losses = jax.lax.scan(descend, dataclasses.replace(state, key=key), minibatches)
         params = new.average if isinstance(new, AveragingState) else new.params
-        held_out = negative_log_likelihood(apply, params, held_out_obs, expert.held_out_action)
-        better = held_out < state.held_out_loss
-        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), params, state.actor.policy_params)
-        actor = Actor(policy_params=best, obs_statistics=statistics)
-        new = dataclasses.replace(new, actor=actor, held_out_loss=jnp.minimum(held_out, state.held_out_loss))
+        losses_held_out = negative_log_likelihoods(apply, params, held_out_obs, expert.held_out_action)
+        held_out, margin = jnp.mean(losses_held_out), jnp.zeros(())
+        if config.cloning_selection == "one_standard_error":
+            margin = jnp.std(losses_held_out) / losses_held_out.size**0.5
+        bar = jnp.minimum(state.held_out_loss, held_out + margin)
+        kept = jax.tree.map(lambda new, old: jnp.where(held_out <= bar, new, old), params, state.actor.policy_params)
+        new = dataclasses.replace(new, actor=Actor(policy_params=kept, obs_statistics=statistics), held_out_loss=bar)
         return new, {"loss": jnp.mean(losses), "held_out_loss": held_out}
 
     return Agent(init, step)
