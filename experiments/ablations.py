@@ -50,6 +50,11 @@ def _after_cloning(text: str, field: str, values: Sequence[Any]) -> Question:
 
 QUESTIONS: Mapping[str, Question] = {
     "cloning_updates": _one_field("Does it help to begin with a clone?", "cloning_updates", (20_000, 0)),
+    "cloning_selection": _after_cloning(
+        "Is cloning ended by the lowest held-out loss, or by what that cannot tell from it?",
+        "cloning_selection",
+        ("one_standard_error", "lowest"),
+    ),
     "action_likelihood": _one_field(
         "Is an action at a bound taken for all draws beyond it?", "action_likelihood", ("censored", "gaussian")
     ),

@@ -1,11 +1,13 @@
 """The pages: their links lead somewhere, and the README stays what is read in two minutes."""
 
 import importlib.util
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -95,18 +97,72 @@ def test_every_shipped_expert_has_a_picture_on_the_page() -> None:
     assert sum(path.stat().st_size for path in (ROOT / "docs" / "figures" / "experts").iterdir()) < 400_000
 
 
+def script(path: str) -> Any:
+    """A script of the documentation, as a module."""
+    spec = importlib.util.spec_from_file_location(Path(path).stem, ROOT / "docs" / path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def test_the_pictures_are_of_the_tasks_as_they_are() -> None:
     """Drawn anew, one is the same but for the colours that a small file has."""
-    script = ROOT / "docs" / "figures" / "make_tasks.py"
-    spec = importlib.util.spec_from_file_location("make_tasks", script)
-    assert spec and spec.loader
-    make_tasks = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(make_tasks)
+    make_tasks = script("figures/make_tasks.py")
     with Image.open(make_tasks.FOLDER / "HalfCheetah.png") as shipped:
         kept = np.asarray(shipped.convert("RGB"), float)
     drawn = np.asarray(make_tasks.draw("HalfCheetah"), float)
     assert np.abs(drawn - kept).mean() < 1.0
     assert np.abs(drawn - drawn[0, 0]).mean() > 10.0  # it is not all sky
+
+
+def test_the_table_of_results_has_the_numbers_of_the_runs() -> None:
+    make_table = script("results/make_table.py")
+    entries = json.loads(make_table.NUMBERS.read_text(encoding="utf-8"))
+    page = make_table.PAGE.read_text(encoding="utf-8")
+    assert make_table.with_table(page, entries) == page
+    assert make_table.updated(entries, []) == entries
+
+
+def test_a_row_of_the_table_of_results_by_hand(tmp_path: Path) -> None:
+    """Two seeds with 110 and 80 of 110 to be recovered from 10, and standard errors of 3 and 4: 5 / 2 is 2.5 %."""
+    make_table = script("results/make_table.py")
+    seeds = [
+        {
+            "recovered_return": recovered,
+            "episode_return": episode_return,
+            "episode_return_standard_error": error,
+            "episode_cost": cost,
+            "episode_cost_standard_error": 0.1,
+        }
+        for recovered, episode_return, error, cost in ((100.0, 110.0, 3.0, 20.0), (70.0, 80.0, 4.0, 31.0))
+    ]
+    started = {
+        "demonstrations": {"num_episodes": 10},
+        "seed": 1000,
+        "eval_episodes": 50,
+        "git_commit": "abc",
+        "versions": {"python": "3.11", "jax": "1", "mujoco": "3", "flax": "1"},
+    }
+    ended = {
+        "task": "Hopper",
+        "method": "malm",
+        "env_steps": 300_000,
+        "expert_return": 110.0,
+        "expert_cost": 25.0,
+        "expert_cost_standard_error": 1.25,
+        "random_return": 10.0,
+        "wall_seconds": 12.3,
+        "per_seed": seeds,
+    }
+    for name, content in (("config.json", started), ("summary.json", ended)):
+        (tmp_path / name).write_text(json.dumps(content), encoding="utf-8")
+    entry = make_table.entry_of(tmp_path)
+    row = "| Hopper, 10 | malm | 300,000 | 100.0, 70.0 | 85.0 +- 2.5 | 20.0, 31.0 | 25.5 +- 0.07 |"
+    assert make_table.row(entry, is_first=True) == f"{row} 25.0 +- 1.2 |"
+    assert make_table.row(entry, is_first=False) == f"{row} |"
+    newer, longer = {**entry, "seed": 7}, {**entry, "env_steps": 1_000_000}
+    assert make_table.updated([longer, entry], [newer]) == [newer, longer]
 
 
 def test_every_metric_is_explained() -> None:

@@ -19,7 +19,7 @@ _BOX, _ELLIPSOID, _MESH = int(_GEOM.mjGEOM_BOX), int(_GEOM.mjGEOM_ELLIPSOID), in
 _SIMPLE = (_SPHERE, _CAPSULE, _CYLINDER, _BOX, _ELLIPSOID)
 PAID = "#d1495b"  # the learner's body while it pays a cost
 COLORS = {  # by kind; the last two digits are the opacity
-    "scenery": "#8a8f9866",
+    "scenery": "#cfd2d6ff",
     "body": "#0b6e99ff",
     "robot": "#22262bff",
     "hazards": "#3f6fb573",
