@@ -173,8 +173,8 @@ MUTATIONS = (
     Mutation(
         "behaviour cloning keeps its last parameters",
         "ccil_jax/agents/behavior_cloning.py",
-        "better = held_out < state.held_out_loss",
-        "better = held_out <= jnp.inf",
+        "jnp.where(held_out <= bar, new, old)",
+        "jnp.where(held_out <= jnp.inf, new, old)",
         ("tests/test_behavior_cloning.py",),
     ),
     Mutation(

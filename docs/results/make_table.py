@@ -84,7 +84,7 @@ def row(entry: Mapping[str, Any], *, is_first: bool) -> str:
 def each_and_mean(values: Sequence[float], errors: Sequence[float]) -> tuple[str, str]:
     """The values of the seeds, and their mean with its standard error, which has two digits where one would be 0."""
     error = math.hypot(*errors) / len(errors)
-    mean = f"{sum(values) / len(values):.1f} +- {error:.{1 if error >= 0.095 else 2}f}"
+    mean = f"{math.fsum(values) / len(values):.1f} +- {error:.{1 if error >= 0.095 else 2}f}"
     return ", ".join(f"{value:.1f}" for value in values), mean
 
 
