@@ -44,11 +44,6 @@ TD_LAMBDA = Use(
     "on-policy methods whose critic_target is td_lambda",
     lambda config: config.critic_target == "td_lambda",
 )
-AVERAGED = Use(
-    lambda row: row.agent in ("on_policy", "behavior_cloning"),
-    "methods with a Gaussian policy whose policy_average is polynomial_decay",
-    lambda config: config.policy_average == "polynomial_decay",
-)
 IMITATING = Use(lambda row: row.imitates, "every method that imitates ({methods})")
 IMITATION = Use(
     lambda row: row.agent == "on_policy" and row.reward == "discriminator",
@@ -102,6 +97,11 @@ LAGRANGIAN_LOSS = Use(
 )
 CVAG = Use(lambda row: row.constraint == "alternating")
 GAUSSIAN = Use(lambda row: row.agent in ("on_policy", "behavior_cloning"), "methods with a Gaussian policy ({methods})")
+AVERAGED = Use(
+    GAUSSIAN.reads,
+    "methods with a Gaussian policy whose policy_average is polynomial_decay",
+    lambda config: config.policy_average == "polynomial_decay",
+)
 CLONING = Use(
     lambda row: row.imitates and row.agent in ("on_policy", "behavior_cloning", "iq_learn"),
     "methods that can begin with a clone ({methods})",

@@ -20,7 +20,7 @@ HEADER = (
     "| task, demonstrations | method | steps | recovered return of each seed, % | mean | cost of each seed | mean "
     "| the demonstrations' cost |"
 )
-FEWEST = 3  # demonstrations whose standard error is worth showing
+FEW = 3  # demonstrations, of which the standard error of their cost is not shown: it is hardly known itself
 Entry = dict[str, Any]
 
 
@@ -91,7 +91,7 @@ def each_and_mean(values: Sequence[float], errors: Sequence[float]) -> tuple[str
 def demonstrations_cost(entry: Mapping[str, Any]) -> str:
     """Their mean with its standard error, unless they are too few for that."""
     cost, error = entry["expert_cost"], entry["expert_cost_standard_error"]
-    return f"{cost:.1f}" if error is None or entry["demonstrations"] <= FEWEST else f"{cost:.1f} +- {error:.1f}"
+    return f"{cost:.1f}" if entry["demonstrations"] <= FEW else f"{cost:.1f} +- {error:.1f}"
 
 
 def table(entries: Sequence[Entry]) -> str:
