@@ -18,6 +18,8 @@ from ccil_jax.demonstrations.trajectories import Demonstrations
 from ccil_jax.training import runner
 from tests.probe_envs import Walk, assert_same_bits, numpy_policy, quick_compilation, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 SLOPE, STD = np.array([0.5, -0.3]), 0.2
 
 

@@ -34,6 +34,8 @@ from tests.probe_envs import (
     walk_demonstrations,
 )
 
+pytestmark = pytest.mark.once
+
 
 def walk_expert() -> ExpertData:
     expert = expert_data(walk_demonstrations())

@@ -35,6 +35,8 @@ from tests.probe_envs import (
     walk_demonstrations,
 )
 
+pytestmark = pytest.mark.once
+
 NARROW = Walk(action_bound=0.4)  # so that the prior's standard deviation is not 1
 COHERENT: dict[str, Any] = {"imitation_reward": "coherent", "cloning_updates": 200, "actor_learning_rate": 0.01}
 

@@ -15,6 +15,8 @@ from envs.base import State
 from envs.testing import check_environment
 from tests.probe_envs import Counter, Walk, same_bits
 
+pytestmark = pytest.mark.once
+
 
 def effort(before: State, action: jax.Array, after: State) -> jax.Array:
     del before, after

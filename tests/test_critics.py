@@ -18,6 +18,8 @@ from ccil_jax.learning import regression
 from ccil_jax.types import Batch
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 IDENTITY = Network(init=lambda key: (), apply=lambda params, x: x)
 
 

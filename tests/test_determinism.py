@@ -19,6 +19,8 @@ from ccil_jax.training.manifests import Identity
 from ccil_jax.training.program import compile_program
 from tests.probe_envs import Walk, assert_same_bits, quick_compilation, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 IN_A_PROCESS = """
 import hashlib, json, jax, numpy
 from ccil_jax.training import runner

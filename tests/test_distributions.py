@@ -19,6 +19,8 @@ from envs.base import State
 from envs.jax_tools import full_precision
 from tests.probe_envs import Probe, assert_same_bits, same_bits, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 MEAN, LOG_STD = np.array([[0.5, -1.0], [2.0, 0.0]]), np.array([0.3, -0.7])
 OTHER_MEAN, OTHER_LOG_STD = np.array([[0.1, -0.8], [1.5, 0.4]]), np.array([-0.2, 0.1])
 

@@ -26,6 +26,8 @@ from experiments.policies.evaluating import Loaded
 from experiments.policies.numpy_policy import policies
 from tests.probe_envs import Walk
 
+pytestmark = pytest.mark.once
+
 SHIPPED = policy_file.shipped().parent / "demonstrations"
 
 

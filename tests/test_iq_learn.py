@@ -22,6 +22,8 @@ from ccil_jax.training import runner
 from envs.jax_tools import full_precision
 from tests.probe_envs import Walk, assert_same_bits, quick_compilation, same_bits, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 
 def iq_config(**changes: Any) -> Config:
     settings = {"method": "iq_learn", "generator_steps": 1, "replay_size": 64, "activation": "relu", "temperature": 0.1}

@@ -31,6 +31,8 @@ from tests.probe_envs import (
     walk_demonstrations,
 )
 
+pytestmark = pytest.mark.once
+
 KINDS = ("full", "direct", "indirect")
 STEP = 1e-5  # of the central differences: their error is about STEP^2 + 1e-16 / STEP
 

@@ -20,6 +20,8 @@ from envs.locomotion import Locomotion, LocomotionTask
 from envs.physics import Data
 from envs.testing import check_environment
 
+pytestmark = pytest.mark.once
+
 gymnasium = pytest.importorskip("gymnasium")
 NATIVE: Any = {"rtol": 1e-5, "atol": 1e-6}  # only conversions to float32 round
 NUM_STEPS = 60

@@ -19,6 +19,8 @@ from ccil_jax.errors import ConfigError
 from ccil_jax.training.runner import load
 from tests.probe_envs import Walk, assert_same_bits, quick_compilation, same_bits, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 
 def rising_factorial(k: int, power: int) -> float:
     return float(np.prod([k + i for i in range(power)]))

@@ -15,6 +15,8 @@ from ccil_jax.training import runner
 from ccil_jax.training.runner import Result
 from tests.probe_envs import Conflict, Sign, quick_compilation
 
+pytestmark = pytest.mark.once
+
 # Values --------------------------------------------------------------------------------------------------------------
 
 

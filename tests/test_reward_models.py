@@ -16,6 +16,8 @@ from ccil_jax.learning.reward_models import Discriminator, RewardModel
 from ccil_jax.types import ExpertData, Metrics, Transition
 from tests.probe_envs import same_bits, steps_to_judge
 
+pytestmark = pytest.mark.once
+
 LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([1.0, 2.0], np.float32)
 
 

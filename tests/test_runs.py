@@ -35,6 +35,8 @@ from tests.probe_envs import (
     walk_demonstrations,
 )
 
+pytestmark = pytest.mark.once
+
 NUM_SEEDS = 2
 CHOICES = ((1.0, 0.02, 0.5), (2.0, 0.0, 0.25), (0.5, 0.1, 0.0))  # cost limit, step size and start of the multiplier
 
@@ -262,7 +264,6 @@ print(json.dumps({
 """
 
 
-@pytest.mark.once
 @pytest.mark.parametrize("method", ["trpo", pytest.param("malm", marks=pytest.mark.slow)])
 def test_devices_share_runs_without_a_word(method: str) -> None:
     """Four CPU devices: nothing travels between them; in turn, a run has the bits that it has on one, or alone."""
@@ -276,7 +277,6 @@ def test_devices_share_runs_without_a_word(method: str) -> None:
     assert found == {"devices": [1, 1, 3, 4], "evaluations": [1, 3, 3, 4], "alone": True, "collectives": []}
 
 
-@pytest.mark.once
 def test_a_chunk_of_iterations_stays_on_its_device() -> None:
     """A compiled iteration over MJX physics does not speak to the host, and what it needs is refused from there."""
     env = envs.make("Swimmer", physics="mjx")

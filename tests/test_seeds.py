@@ -17,6 +17,8 @@ from ccil_jax.types import Metrics
 from envs.base import State
 from tests.probe_envs import Walk, quick_compilation, same_bits, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 NUM_SEEDS = 3
 
 

@@ -18,6 +18,8 @@ from ccil_jax.training import guard
 from envs.adapters import GymnasiumVectorEnv
 from tests.probe_envs import Walk, quick_compilation, walk_config, walk_demonstrations
 
+pytestmark = pytest.mark.once
+
 LEARNERS: dict[str, dict[str, Any]] = {
     "malm": {"method": "malm", "held_out_unit": "trajectory"},
     "malm, other choices": {

@@ -17,6 +17,8 @@ from ccil_jax.learning.trust_region import Directions
 from ccil_jax.types import Metrics, PyTree
 from tests.probe_envs import PolicyProblem, assert_same_bits, numpy_log_prob, numpy_policy, policy_problem, same_bits
 
+pytestmark = pytest.mark.once
+
 
 def matrix_product(matrix: Any) -> Callable[[jax.Array], jax.Array]:
     return lambda vectors: vectors @ jnp.asarray(matrix)
