@@ -65,6 +65,7 @@ CHOICES: Mapping[str, tuple[str, ...]] = {
     "discriminator_regularizer": ("none", "gradient_penalty", "spectral_norm"),
     "critic_target": ("gae", "td_lambda"),
     "policy_average": ("none", "polynomial_decay"),
+    "evaluated_action": ("sample", "mode"),
     "cloning_selection": ("lowest", "one_standard_error"),
     "mirrored_demonstrations": ("none", "symmetric_tasks"),
     "value_loss": ("value", "v0"),
@@ -198,6 +199,12 @@ class Config:
         "the noise of single steps cancels (Shamir and Zhang 2013); rollouts are of the newest policy either way. "
         "Cloning averages over its gradient steps in the same way (Block et al. 2024)",
         GAUSSIAN,
+    )
+    evaluated_action: str = _static(
+        "sample",
+        "how the policy acts when it is evaluated, recorded and shown: sample draws its actions from its distribution, "
+        "as while it learns, mode takes the most likely one, without the noise that learning needs",
+        ALL,
     )
     critic_intervals: int = _static(
         0,
@@ -418,6 +425,10 @@ class Config:
     def num_training(self) -> int:
         """M: samples of the policy step and the critic regressions."""
         return self.batch_size - self.num_held_out
+
+    def acts_by_mode(self, told: bool | None = None) -> bool:
+        """Whether the policy acts with the modes of its distribution, once learnt: as told, else `evaluated_action`."""
+        return self.evaluated_action == "mode" if told is None else told
 
     def reads(self, name: str) -> bool:
         """Whether the field `name` makes a difference to what this configuration trains."""

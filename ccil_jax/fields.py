@@ -34,6 +34,7 @@ class Fields(TypedDict, total=False):
     fisher_stride: int
     line_search_steps: int
     policy_average: str
+    evaluated_action: str
     critic_intervals: int
     critic_target: str
     normalize_values: bool

@@ -50,7 +50,10 @@ def make_parser() -> Parser:
         help="ours, or gymnasium's own -v5 environments (one process, NumPy) (default: ours)",
     )
     parser.add_argument(
-        "--deterministic", action="store_true", help="act with the mode of the policy instead of sampling"
+        "--deterministic",
+        action=argparse.BooleanOptionalAction,
+        help="act with the mode of the policy, or sample with --no-deterministic (default: as the training's "
+        "--evaluated-action says)",
     )
     parser.add_argument(
         "--seed", default=1, type=command_line.natural, metavar="N", help="of the episodes (default: 1)"
@@ -134,7 +137,7 @@ def run(arguments: argparse.Namespace) -> None:
     env = source.build()
     if arguments.video:
         check_drawing(arguments.video, source.task.name, env)
-    loaded, settings = source.load(env), _settings(arguments)
+    loaded, settings = source.load(env), _settings(arguments, source.config)
     unit = "steps" if arguments.simulator == "ours" else "episodes"
     with waiting.progress("evaluating", unit) as on_progress:
         episodes = evaluating.play(loaded, settings, on_progress)
@@ -216,8 +219,11 @@ def check_recording(arguments: argparse.Namespace, source: Source) -> None:
                 f"--seed-index {arguments.seed_index}: says what to record, export or show; add --record FILE.npz, "
                 "--export FILE.npz or --video FILE.gif"
             )
-    if arguments.record and arguments.deterministic:
-        raise UsageError("--deterministic: demonstrations are recorded from sampled actions; leave one of the two out")
+    if arguments.record and arguments.deterministic is not None:
+        option = "--deterministic" if arguments.deterministic else "--no-deterministic"
+        raise UsageError(
+            f"{option}: demonstrations are recorded as the training's --evaluated-action says; leave one of the two out"
+        )
     if arguments.record and arguments.simulator == "original":
         raise UsageError("--simulator original: demonstrations are recorded in ours; leave one of the two out")
     if arguments.seed_index is not None and arguments.seed_index not in source.seeds:
@@ -266,12 +272,12 @@ def describe_recording(
     return recording.facts(trained, scores, chosen, num_episodes, made_by)
 
 
-def _settings(arguments: argparse.Namespace) -> Settings:
+def _settings(arguments: argparse.Namespace, config: Config) -> Settings:
     return Settings(
         simulator=arguments.simulator,
         num_episodes=arguments.episodes,
         seed=arguments.seed,
-        deterministic=arguments.deterministic,
+        deterministic=config.acts_by_mode(arguments.deterministic),
         shared_episodes=arguments.shared_episodes,
     )
 

@@ -141,7 +141,7 @@ def evaluate(
     *,
     num_episodes: int = 50,
     seed: int = 0,
-    deterministic: bool = False,
+    deterministic: bool | None = None,
     draws: Sequence[int] | None = None,
     policy: Policy | None = None,
     on_progress: Callable[[int, int], None] | None = None,
@@ -156,7 +156,8 @@ def evaluate(
         env: the task, unbatched.
         num_episodes: for each policy.
         seed: of all random numbers.
-        deterministic: act with the mode of the policy's distribution, instead of stochastically as in training.
+        deterministic: act with the mode of the policy's distribution (true), or sample from it as in training (false);
+            None does what the training's `evaluated_action` says.
         draws: one number for each policy. Policies with the same number play episodes with the same initial states,
             layouts and noise, which makes comparisons between them paired. None stands for 0 to S - 1: then the means
             of the policies are independent.
@@ -171,12 +172,13 @@ def evaluate(
     """
     if num_episodes < 1:
         raise ValueError(f"num_episodes {num_episodes}: must be at least 1")
+    by_mode = config.acts_by_mode(deterministic)
     keys = _keys(seed, range(_num_rows(actor)) if draws is None else draws)
     actor, keys = _placed((actor, keys))
 
     def play_on(runs: tuple[Actor, Playing, jax.Array]) -> tuple[Playing, Charged]:
         actor, playing, keys = runs
-        playing, steps = _play_on(env, _learnt(config, env, actor, deterministic, policy), playing, keys)
+        playing, steps = _play_on(env, _learnt(config, env, actor, by_mode, policy), playing, keys)
         return playing, _charged(steps)
 
     playing, step_keys = _spread(lambda key: _begin(env, num_episodes, key), keys)
@@ -242,7 +244,7 @@ def record(
     metadata: dict[str, Any] | None = None,
     policy: Policy | None = None,
 ) -> Demonstrations:
-    """Demonstrations of one policy, which acts stochastically.
+    """Demonstrations of one policy, which acts as `config.evaluated_action` says.
 
     Args:
         config: of the training.
@@ -259,7 +261,7 @@ def record(
 
     @jax.jit
     def run(actor: Actor, key: jax.Array) -> Trajectories:
-        return run_episodes(env, _learnt(config, env, actor, False, policy), num_episodes, key)
+        return run_episodes(env, _learnt(config, env, actor, config.acts_by_mode(), policy), num_episodes, key)
 
     steps = jax.tree.map(np.asarray, run(actor, jax.random.key(seed)))
     keep = steps.valid.T  # [N, T]: one episode after the other

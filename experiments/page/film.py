@@ -61,14 +61,14 @@ def obstacle(env: Any) -> str:
     return "" if drawn(model, range(1, model.nbody)) else "no body of its MuJoCo model has a shape to draw"
 
 
-def record(loaded: Loaded, index: int, *, seed: int = 0, deterministic: bool = False) -> Film:
+def record(loaded: Loaded, index: int, *, seed: int = 0, deterministic: bool | None = None) -> Film:
     """A whole episode of a policy in our simulator.
 
     Args:
         loaded: policies of a task that can be drawn, see `obstacle`.
         index: of the policy that acts.
         seed: of the episode.
-        deterministic: act with the mode of the policy instead of sampling.
+        deterministic: act with the mode of the policy (true) or sample (false); None does what the training says.
     """
     import jax
 
@@ -77,6 +77,7 @@ def record(loaded: Loaded, index: int, *, seed: int = 0, deterministic: bool = F
     from envs.jax_tools import full_precision
 
     env = loaded.env
+    by_mode = loaded.config.acts_by_mode(deterministic)
     apply = networks.policy_of(loaded.config, env).apply
 
     def look(state: Any) -> Any:
@@ -94,7 +95,7 @@ def record(loaded: Loaded, index: int, *, seed: int = 0, deterministic: bool = F
 
         noise = jax.random.normal(noise_key, (env.max_episode_steps, env.action_dim))
         start = env.reset(reset_key)
-        return look(start), jax.lax.scan(step, start, noise * (not deterministic))[1]
+        return look(start), jax.lax.scan(step, start, noise * (not by_mode))[1]
 
     actor = jax.tree.map(lambda leaf: leaf[index], loaded.actor)
     first, later = jax.device_get(run(actor, jax.random.key(seed)))

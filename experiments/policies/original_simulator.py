@@ -37,7 +37,7 @@ def evaluate(
     *,
     num_episodes: int,
     seed: int = 0,
-    deterministic: bool = False,
+    deterministic: bool | None = None,
     draws: Sequence[int] | None = None,
     contact_cost: bool = True,
     on_progress: Callable[[int, int], None] | None = None,
@@ -51,7 +51,7 @@ def evaluate(
         random = np.random.default_rng([seed, draw])
         for episode in range(num_episodes):
             (start,) = np.random.SeedSequence([seed, draw, episode]).generate_state(1)
-            steps = run_episode(simulator, policy, random, int(start), deterministic)
+            steps = run_episode(simulator, policy, random, int(start), config.acts_by_mode(deterministic))
             results.append(score(env, steps, contact_cost))
             if on_progress is not None:
                 on_progress(len(results), len(learnt) * num_episodes)

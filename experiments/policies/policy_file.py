@@ -61,6 +61,7 @@ class PolicyFile:
             method="iq_learn" if self.squashed else "trpo",
             hidden_sizes=tuple(bias.shape[1] for _, bias in self.layers[:-1]),
             activation=self.metadata["activation"],
+            evaluated_action=self.training.get("evaluated_action", "sample"),  # which files of earlier versions lack
         )
 
     def check_sizes(self, obs_dim: int, action_dim: int) -> None:
@@ -191,6 +192,8 @@ def _check_metadata(path: Path, metadata: dict[str, Any]) -> None:
         raise ArchiveError(f"{path}: 'metadata' has no sound training.cost_limit; {_AGAIN}")
     if metadata.get("activation") not in CHOICES["activation"]:
         raise ArchiveError(f"{path}: 'metadata' has no known activation; {_AGAIN}")
+    if training.get("evaluated_action", "sample") not in CHOICES["evaluated_action"]:
+        raise ArchiveError(f"{path}: 'metadata' has no known training.evaluated_action; {_AGAIN}")
     levels = metadata.get("levels")
     if not (isinstance(levels, dict) and all(x is None or type(x) in (int, float) for x in levels.values())):
         raise ArchiveError(f"{path}: 'metadata' has no sound levels of an expert; {_AGAIN}")

@@ -235,7 +235,11 @@ def _finish(
         "method": plan.config.method,
         "num_seeds": setup.num_seeds,
         **dataclasses.asdict(reference),
-        "evaluation": {"simulator": "ours", "num_episodes": setup.eval_episodes, "deterministic": False},
+        "evaluation": {
+            "simulator": "ours",
+            "num_episodes": setup.eval_episodes,
+            "deterministic": plan.config.acts_by_mode(),
+        },
         "per_seed": rows,
         "aggregate": aggregate,
         "violation_beyond_error": summary.mean_violation_beyond_error(rows, reference),  # of the mean over seeds

@@ -80,6 +80,7 @@ def training(run: Run, env_steps: int | None) -> dict[str, Any]:
         "task": run.facts["task"],
         "method": run.config.method,
         "cost_limit": cost_limit(run),
+        "evaluated_action": run.config.evaluated_action,
         "env_options": run.facts["env_options"],
         "physics": run.facts["physics"],
         "env_steps": env_steps,
