@@ -9,7 +9,7 @@ import math
 import numbers
 import types
 from collections.abc import Iterable, Mapping
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from ccil_jax.errors import ConfigError
 from ccil_jax.fields import Fields
@@ -28,6 +28,7 @@ from ccil_jax.uses import (
     CVAG,
     GAUSSIAN,
     HELD_OUT,
+    IMITATED_LIMIT,
     IMITATING,
     IMITATION,
     IQ_LEARN,
@@ -46,6 +47,9 @@ from ccil_jax.uses import (
     TD_LAMBDA,
     Use,
 )
+
+if TYPE_CHECKING:  # it imports NumPy
+    from ccil_jax.demonstrations.trajectories import Demonstrations
 
 CLONING_UPDATES_PER_ITERATION = 100  # after as many gradient steps, cloning looks at the held-out steps
 
@@ -348,6 +352,12 @@ class Config:
         "their number of steps divided by batch_size, so that a demonstrated step counts as much as one of the batch",
         CLONED,
     )
+    limit_standard_errors: float = _traced(
+        0.0,
+        "how many of its standard errors the limit lies above the mean cost of the demonstrations, since few episodes "
+        "do not tell the expert's cost exactly; of fewer than three demonstrations the mean itself is the limit",
+        IMITATED_LIMIT,
+    )
     cost_limit: float | None = _traced(
         None,
         "limit of an episode's cost; all other constrained methods take the mean cost of their demonstrations",
@@ -463,22 +473,27 @@ def relevant(config: Config) -> dict[str, Any]:
     return {name: value for name, value in dataclasses.asdict(config).items() if name not in idle}
 
 
-def with_limit_of(config: Config, mean_episode_cost: float) -> Config:
-    """The configuration with its cost limit resolved: J_E where the method takes it from the demonstrations.
+def with_limit_of(config: Config, demonstrations: "Demonstrations") -> Config:
+    """The configuration with its cost limit resolved, where the method takes it from the demonstrations.
+
+    It is J_E + k SE(J_E), with the mean J_E of their episodes' costs (Algorithm 1 line 1), its standard error, and
+    k = `limit_standard_errors`. The error of fewer than three episodes is unknown: then it is J_E.
 
     Raises:
         ConfigError: another limit was given by hand.
     """
     if config.row.limit != "demonstrations":
         return config
-    if _is_traced(config.cost_limit) or config.cost_limit not in (None, mean_episode_cost):
+    error = demonstrations.cost_standard_error if demonstrations.num_episodes >= 3 else None
+    limit = demonstrations.mean_episode_cost + config.limit_standard_errors * (error or 0.0)
+    if _is_traced(config.cost_limit) or config.cost_limit not in (None, limit):
         raise ConfigError(_limit_by_hand(config))
-    return config.replace(cost_limit=mean_episode_cost)
+    return config.replace(cost_limit=limit)
 
 
 def _limit_by_hand(config: Config) -> str:
     return (
-        f"--cost_limit {config.cost_limit}: method {config.method} is held to the mean cost of its demonstrations; "
+        f"--cost_limit {config.cost_limit}: method {config.method} is held to the cost of its demonstrations; "
         "leave it out, or use --method lgail for a limit of your own"
     )
 

@@ -201,7 +201,7 @@ OPTIONS: dict[str, tuple[tuple[str, ...], str]] = {
         "--seed-index 1: says what to record, export or show; add",
     ),
     "record how many": (("evaluate", "done", "--num-trajectories", "3"), "--num-trajectories 3: says what to record"),
-    "record the mode": ((*RECORD, "--deterministic"), "--deterministic: demonstrations are recorded from sampled"),
+    "record the mode": ((*RECORD, "--deterministic"), "--deterministic: demonstrations are recorded as the"),
     "record elsewhere": ((*RECORD, "--simulator", "original"), "--simulator original: demonstrations are recorded in"),
     "record too early": (("evaluate", "half", "--record", "new.npz"), "the run in half is not finished; continue it"),
     "overwrite nothing": (

@@ -51,6 +51,24 @@ def test_seeds_with_the_same_draw_play_the_same_episodes(three: Evaluation) -> N
         np.testing.assert_allclose(rows[0], getattr(three, name)[0], rtol=1e-5)
 
 
+def test_a_policy_acts_as_its_training_says_unless_told_otherwise(three: Evaluation) -> None:
+    """Modes are the same for all noise: recorded actions are then a function of the observations."""
+    by_mode = CONFIG.replace(evaluated_action="mode")
+    settings: dict[str, Any] = {"num_episodes": 8, "seed": 3}
+    modes = evaluation.evaluate(by_mode, actor(3), Walk(), **settings)
+    assert_same_bits(modes, evaluate(3, deterministic=True))
+    assert_same_bits(evaluation.evaluate(by_mode, actor(3), Walk(), deterministic=False, **settings), three)
+    assert not np.allclose(modes.episode_return, three.episode_return)
+
+    one = jax.tree.map(lambda leaf: leaf[0], actor(1))
+    policy = networks.make_policy(CONFIG, Walk().obs_dim, Walk().action_dim)
+    for config, is_mode in ((by_mode, True), (CONFIG, False)):
+        found = evaluation.record(config, one, Walk(), **settings)
+        mode = rollout.act(policy.apply, one, jnp.asarray(found.obs), jnp.zeros_like(jnp.asarray(found.actions)))
+        mode = np.clip(mode, Walk().action_low, Walk().action_high)
+        assert np.allclose(found.actions, mode, atol=1e-6) == is_mode
+
+
 def test_a_recording_ends_with_the_observation_after_the_last_step() -> None:
     """The task's position is its reward, and its second number changes its sign in every step."""
     one = jax.tree.map(lambda leaf: leaf[0], actor(1))

@@ -194,6 +194,10 @@ def without(*keys: str) -> dict[str, Any]:
         ({"metadata": {**METADATA, "training": {**METADATA["training"], "seed_indices": [1]}}}, "do not make up"),
         ({"metadata": {**METADATA, "training": {**METADATA["training"], "cost_limit": "no"}}}, "training.cost_limit"),
         ({"metadata": {**METADATA, "activation": "eval"}}, "no known activation"),
+        (
+            {"metadata": {**METADATA, "training": {**METADATA["training"], "evaluated_action": "best"}}},
+            "no known training.evaluated_action",
+        ),
         ({"metadata": {**METADATA, "levels": None}}, "no sound levels"),
         ({"metadata": {**METADATA, "levels": {"expert_return": "high"}}}, "no sound levels"),
     ],
