@@ -9,7 +9,7 @@ import math
 import numbers
 import types
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Unpack
+from typing import Any, Unpack
 
 from ccil_jax.errors import ConfigError
 from ccil_jax.fields import Fields
@@ -47,9 +47,6 @@ from ccil_jax.uses import (
     TD_LAMBDA,
     Use,
 )
-
-if TYPE_CHECKING:  # it imports NumPy
-    from ccil_jax.demonstrations.trajectories import Demonstrations
 
 CLONING_UPDATES_PER_ITERATION = 100  # after as many gradient steps, cloning looks at the held-out steps
 
@@ -473,19 +470,16 @@ def relevant(config: Config) -> dict[str, Any]:
     return {name: value for name, value in dataclasses.asdict(config).items() if name not in idle}
 
 
-def with_limit_of(config: Config, demonstrations: "Demonstrations") -> Config:
-    """The configuration with its cost limit resolved, where the method takes it from the demonstrations.
+def with_limit_of(config: Config, limit: float) -> Config:
+    """The configuration with its cost limit resolved: `limit`, where the method takes it from the demonstrations.
 
-    It is J_E + k SE(J_E), with the mean J_E of their episodes' costs (Algorithm 1 line 1), its standard error, and
-    k = `limit_standard_errors`. The error of fewer than three episodes is unknown: then it is J_E.
+    `limit` is what `Demonstrations.cost_limit` says of `config.limit_standard_errors`.
 
     Raises:
         ConfigError: another limit was given by hand.
     """
     if config.row.limit != "demonstrations":
         return config
-    error = demonstrations.cost_standard_error if demonstrations.num_episodes >= 3 else None
-    limit = demonstrations.mean_episode_cost + config.limit_standard_errors * (error or 0.0)
     if _is_traced(config.cost_limit) or config.cost_limit not in (None, limit):
         raise ConfigError(_limit_by_hand(config))
     return config.replace(cost_limit=limit)

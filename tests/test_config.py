@@ -308,14 +308,15 @@ def test_every_preset_suits_every_method_that_it_is_given_to(preset: str, method
 
 def test_a_limit_is_resolved_once_and_never_contradicted() -> None:
     demonstrations = walk_demonstrations()
-    config = with_limit_of(Config(method="ccil"), demonstrations)
+    limit = demonstrations.cost_limit(0.0)
+    config = with_limit_of(Config(method="ccil"), limit)
     assert config.cost_limit == 2.25  # the mean of 6, 3, 0, 0, 0.5 and 4
     assert config.prescribed_limit is None
-    assert with_limit_of(config, demonstrations) == config
+    assert with_limit_of(config, limit) == config
     with pytest.raises(ConfigError, match=r"^cost_limit 2\.25: method ccil is held to the cost"):
-        with_limit_of(config, demonstrations.take_episodes(3))
+        with_limit_of(config, demonstrations.take_episodes(3).cost_limit(0.0))
     prescribed = Config(method="lgail", cost_limit=5.0)
-    assert with_limit_of(prescribed, demonstrations) == prescribed
+    assert with_limit_of(prescribed, limit) == prescribed
     assert prescribed.prescribed_limit == 5.0
     with pytest.raises(ConfigError, match=r"cost_limit 9\.0: method malm is held to"):
         build.resolve(walk_config(method="malm").replace(cost_limit=9.0), Walk(), walk_demonstrations())
@@ -327,10 +328,10 @@ def test_a_limit_is_resolved_once_and_never_contradicted() -> None:
 )
 def test_the_limit_lies_standard_errors_above_the_mean_cost(num_episodes: int, limit: float) -> None:
     """By hand, of the costs 6, 3, 0, 0, 0.5 and 4. Two episodes do not tell their error, nor does one."""
-    config = Config(method="ccil", limit_standard_errors=2.0)
-    found = with_limit_of(config, walk_demonstrations().take_episodes(num_episodes))
+    demonstrations = walk_demonstrations().take_episodes(num_episodes)
+    found = build.resolve(walk_config(method="ccil", limit_standard_errors=2.0), Walk(), demonstrations)
     assert found.cost_limit == pytest.approx(limit)
-    assert with_limit_of(found, walk_demonstrations().take_episodes(num_episodes)) == found
+    assert build.resolve(found, Walk(), demonstrations) == found
 
 
 def test_the_methods_with_a_multiplier() -> None:
