@@ -28,7 +28,6 @@ from ccil_jax.uses import (
     CVAG,
     GAUSSIAN,
     HELD_OUT,
-    IMITATED_LIMIT,
     IMITATING,
     IMITATION,
     IQ_LEARN,
@@ -349,12 +348,6 @@ class Config:
         "their number of steps divided by batch_size, so that a demonstrated step counts as much as one of the batch",
         CLONED,
     )
-    limit_standard_errors: float = _traced(
-        0.0,
-        "how many of its standard errors the limit lies above the mean cost of the demonstrations, since few episodes "
-        "do not tell the expert's cost exactly; of fewer than three demonstrations the mean itself is the limit",
-        IMITATED_LIMIT,
-    )
     cost_limit: float | None = _traced(
         None,
         "limit of an episode's cost; all other constrained methods take the mean cost of their demonstrations",
@@ -470,24 +463,22 @@ def relevant(config: Config) -> dict[str, Any]:
     return {name: value for name, value in dataclasses.asdict(config).items() if name not in idle}
 
 
-def with_limit_of(config: Config, limit: float) -> Config:
-    """The configuration with its cost limit resolved: `limit`, where the method takes it from the demonstrations.
-
-    `limit` is what `Demonstrations.cost_limit` says of `config.limit_standard_errors`.
+def with_limit_of(config: Config, mean_episode_cost: float) -> Config:
+    """The configuration with its cost limit resolved: J_E where the method takes it from the demonstrations.
 
     Raises:
         ConfigError: another limit was given by hand.
     """
     if config.row.limit != "demonstrations":
         return config
-    if _is_traced(config.cost_limit) or config.cost_limit not in (None, limit):
+    if _is_traced(config.cost_limit) or config.cost_limit not in (None, mean_episode_cost):
         raise ConfigError(_limit_by_hand(config))
-    return config.replace(cost_limit=limit)
+    return config.replace(cost_limit=mean_episode_cost)
 
 
 def _limit_by_hand(config: Config) -> str:
     return (
-        f"--cost_limit {config.cost_limit}: method {config.method} is held to the cost of its demonstrations; "
+        f"--cost_limit {config.cost_limit}: method {config.method} is held to the mean cost of its demonstrations; "
         "leave it out, or use --method lgail for a limit of your own"
     )
 

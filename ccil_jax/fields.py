@@ -79,5 +79,4 @@ class Fields(TypedDict, total=False):
     chi2_coefficient: float
     temperature: float | None
     cloning_weight: float | None
-    limit_standard_errors: float
     cost_limit: float | None

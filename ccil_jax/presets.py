@@ -17,8 +17,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # of their own, let the cost's advantages lean on them: without that no multiplier lowered the cost of PointGoal1.
     # An average of the policies is judged, in which the noise of single steps cancels, and it acts with its modes,
     # because most falls come from the noise of single actions. Gaps relative to the limit and cost advantages of unit
-    # deviation let one multiplier rate suit tasks of any cost. A cost within the error of the demonstrations' is no
-    # violation: to lower it would take return for what may be no difference at all.
+    # deviation let one multiplier rate suit tasks of any cost.
     "default": {
         "env_steps": 300_000,
         "batch_size": 4000,
@@ -43,7 +42,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "multiplier_update": "sgd",
         "multiplier_learning_rate": 0.5,
         "gap_unit": "limit",
-        "limit_standard_errors": 1.0,
         "outer_loss": "lagrangian",
         "meta_update": "sgd",
         "meta_learning_rate": 1.0,

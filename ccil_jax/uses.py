@@ -66,9 +66,6 @@ STANDARDIZED = Use(
     lambda config: not (config.reads("multiplier_update") and config.multiplier_update == "optimal"),
 )
 LIMITED = Use(lambda row: row.limit == "prescribed", "methods with a prescribed limit ({methods})")
-IMITATED_LIMIT = Use(
-    lambda row: row.limit == "demonstrations", "methods whose limit is the cost of their demonstrations ({methods})"
-)
 LAGRANGIAN = Use(
     lambda row: row.constraint in ("lagrangian", "meta_lagrangian"), "methods with a choice of multiplier ({methods})"
 )

@@ -97,11 +97,6 @@ QUESTIONS: Mapping[str, Question] = {
     "evaluated_action": _one_field(
         "Does the policy act with its modes when it is judged?", "evaluated_action", ("mode", "sample")
     ),
-    "limit_standard_errors": _one_field(
-        "How many standard errors does the limit lie above the demonstrations' mean cost?",
-        "limit_standard_errors",
-        (1.0, 0.0),
-    ),
     "critic_intervals": _one_field("Do critics see observations in intervals?", "critic_intervals", (16, 0)),
     "critic_target": _one_field(
         "Have the critics' targets a lambda of their own?", "critic_target", ("td_lambda", "gae")

@@ -38,7 +38,7 @@ def test_the_first_answer_is_the_papers_or_that_of_the_default(tmp_path: Path) -
 
     newer = {"cloning_updates", "action_likelihood", "cloning_weight", "warmup_iterations", "outer_loss", "gap_unit"}
     newer |= {"critic_intervals", "critic_target", "cost_gae_lambda", "mirrored_demonstrations", "batch_size"}
-    newer |= {"imitation_reward", "policy_average", "cloning_selection", "evaluated_action", "limit_standard_errors"}
+    newer |= {"imitation_reward", "policy_average", "cloning_selection", "evaluated_action"}
     assert changed(QUESTIONS, "paper") == newer
     assert changed(newer, "default") == set()
 

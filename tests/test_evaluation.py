@@ -65,8 +65,8 @@ def test_a_policy_acts_as_its_training_says_unless_told_otherwise(three: Evaluat
     for config, is_mode in ((by_mode, True), (CONFIG, False)):
         found = evaluation.record(config, one, Walk(), **settings)
         mode = rollout.act(policy.apply, one, jnp.asarray(found.obs), jnp.zeros_like(jnp.asarray(found.actions)))
-        mode = np.clip(mode, Walk().action_low, Walk().action_high)
-        assert np.allclose(found.actions, mode, atol=1e-6) == is_mode
+        executed = np.clip(mode, Walk().action_low, Walk().action_high)
+        assert np.allclose(found.actions, executed, atol=1e-6) == is_mode
 
 
 def test_a_recording_ends_with_the_observation_after_the_last_step() -> None:

@@ -150,7 +150,7 @@ def resolve(config: Config, env: Environment, demonstrations: Demonstrations | N
             raise ConfigError(str(error)) from error
     if demonstrations is None:
         return config
-    config = with_limit_of(config, demonstrations.cost_limit(config.limit_standard_errors))
+    config = with_limit_of(config, demonstrations.mean_episode_cost)
     return kind_of(config).resolve(config, env, demonstrations)
 
 

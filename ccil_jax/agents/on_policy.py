@@ -96,7 +96,7 @@ class Parts(NamedTuple):
 
     @property
     def limit(self) -> jax.Array:
-        """[] of the cost of an episode; 0 for a method without a limit, which never reads it."""
+        """[] J_E, per episode; 0 for a method without a limit, which never reads it."""
         limit = self.config.cost_limit
         return jnp.asarray(0.0 if limit is None else limit, jnp.result_type(float))
 

@@ -81,13 +81,8 @@ class Demonstrations:
 
     @property
     def mean_episode_cost(self) -> float:
-        """J_E, the mean cost of an episode: the limit of Algorithm 1 (line 1)."""
+        """J_E, the mean cost of an episode: what that of the learner must not exceed (Algorithm 1 line 1)."""
         return float(np.mean(self.episode_costs))
-
-    def cost_limit(self, standard_errors: float) -> float:
-        """J_E + `standard_errors` SE(J_E); J_E alone for fewer than three episodes, which do not tell their error."""
-        error = self.cost_standard_error if self.num_episodes >= 3 else None
-        return self.mean_episode_cost + standard_errors * (error or 0.0)
 
     @property
     def mean_episode_return(self) -> float | None:

@@ -160,7 +160,7 @@ def plan_of(
     env_options = options.env_options(choices, task)
     path, demonstrations = find_demonstrations(config, task, choices["demos"], choices["num_demos"], env_options, load)
     if demonstrations is not None:
-        config = with_limit_of(config, demonstrations.cost_limit(config.limit_standard_errors))
+        config = with_limit_of(config, demonstrations.mean_episode_cost)
     return RunPlan(
         setup=make_setup(choices, task, env_options, path, demonstrations),
         config=config,
