@@ -38,6 +38,7 @@ def entry_of(run: Path) -> Entry:
         "env_steps": ended["env_steps"],
         "seed": started["seed"],
         "episodes_per_seed": started["eval_episodes"],
+        "deterministic": ended["evaluation"]["deterministic"],
         **{name: ended[name] for name in ("expert_return", "expert_cost", "expert_cost_standard_error")},
         "random_return": ended["random_return"],
         "wall_seconds": round(ended["wall_seconds"]),
@@ -65,14 +66,13 @@ def updated(entries: Sequence[Entry], new: Sequence[Entry]) -> list[Entry]:
 def row(entry: Mapping[str, Any], *, is_first: bool) -> str:
     """A line of the table; the first of a task and its demonstrations tells what those cost.
 
-    An entry that is marked as `earlier` by hand is of a version whose results would differ: (e).
     The standard error of a mean over the seeds is that over their episodes, as if the policies were given.
     """
     percent = 100 / (entry["expert_return"] - entry["random_return"])
     return_errors = [percent * error for error in entry["episode_return_standard_error"]]
     cells = [
         f"{entry['task']}, {entry['demonstrations']}",
-        entry["method"] + " (e)" * entry.get("earlier", False),
+        entry["method"],
         f"{entry['env_steps']:,}" if entry["env_steps"] else "-",
         *each_and_mean(entry["recovered_return"], return_errors),
         *each_and_mean(entry["episode_cost"], entry["episode_cost_standard_error"]),
