@@ -82,7 +82,7 @@ def _add_files(parser: Parser) -> None:
         "--record",
         type=Path,
         metavar="FILE",
-        help="also record demonstrations by the policy of one seed, in our simulator and with sampled actions, as "
+        help="also record demonstrations by the policy of one seed, in our simulator and acting as it is evaluated, as "
         f"{demonstration_files.TO_WRITE}",
     )
     parser.add_argument(

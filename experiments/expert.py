@@ -188,7 +188,7 @@ def _export(file: Path, loaded: Loaded, episodes: Any, setup: Setup) -> None:
         simulator="ours",
         num_episodes=setup.eval_episodes,
         seed=setup.evaluation_seed,
-        deterministic=False,
+        deterministic=loaded.config.acts_by_mode(),
         shared_episodes=False,
     )
     facts = {**evaluating.facts_of(loaded, settings), "command": loaded.command}
