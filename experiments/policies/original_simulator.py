@@ -47,11 +47,12 @@ def evaluate(
     `contact_cost` is the option of that name with which `env` was made. `on_progress` counts episodes.
     """
     simulator, learnt, results = make_simulator(env), policies(config, actor, env), []
+    by_mode = config.acts_by_mode(deterministic)
     for draw, policy in zip(range(len(learnt)) if draws is None else draws, learnt, strict=True):
         random = np.random.default_rng([seed, draw])
         for episode in range(num_episodes):
             (start,) = np.random.SeedSequence([seed, draw, episode]).generate_state(1)
-            steps = run_episode(simulator, policy, random, int(start), config.acts_by_mode(deterministic))
+            steps = run_episode(simulator, policy, random, int(start), by_mode)
             results.append(score(env, steps, contact_cost))
             if on_progress is not None:
                 on_progress(len(results), len(learnt) * num_episodes)
